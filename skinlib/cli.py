@@ -1,0 +1,294 @@
+"""The command line: `skinlib skin | train | evaluate | demo | check`.
+
+Each command is a function; its signature and docstring are its options and its help.
+Everything slow to import is imported when a command runs, so that `--help` is quick.
+"""
+
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from skinlib.head import Head, HeadError
+from skinlib.paths import DEFAULT_CHECKPOINT
+
+BAD_INPUT, INTERRUPTED = 2, 130
+
+Input = Annotated[Positional[Path], arg(metavar="IN")]
+Output = Annotated[Positional[Path], arg(metavar="OUT")]
+Folder = Annotated[Path, arg(metavar="DIR")]
+OptionalFolder = Annotated[Path | None, arg(metavar="DIR")]
+Checkpoint = Annotated[str, arg(metavar="NAME|FILE")]
+OptionalCheckpoint = Annotated[str | None, arg(metavar="NAME|FILE")]
+
+
+def skin(
+    source: Input,
+    target: Output,
+    *,
+    checkpoint: Checkpoint = DEFAULT_CHECKPOINT,
+    max_influences: Annotated[int | None, arg(metavar="N")] = None,
+    lock: Annotated[tuple[str, ...], arg(metavar="BONE ...")] = (),
+    symmetric: bool = False,
+) -> None:
+    """Compute skin weights for a head.
+
+    IN holds one head and its bones: a .glb or .gltf as exported from Blender, Maya or
+    Unreal, or a .npz. Any unit, any up-axis, 1 to 200 bones with any names. It may be
+    skinned already, or not at all. OUT is a .glb or .npz. From .glb to .glb everything
+    else in the file is kept: materials, blend shapes, other meshes, animations.
+
+    For example:
+      skinlib skin head.glb skinned.glb
+      skinlib skin head.glb game.glb --max-influences 4 --symmetric
+      skinlib skin painted.glb new.glb --lock jaw tongue
+
+    Args:
+        source: The head to skin.
+        target: Where the skinned head goes; replaced when it exists.
+        checkpoint: A shipped network, or a folder that `skinlib train` wrote.
+        max_influences: At most N bones a vertex; all that matter when left out.
+        lock: Bones whose weights in IN stay exactly as they are painted.
+        symmetric: Same weights on the left and on the right, where the mesh has both.
+    """
+    from skinlib.io import read_head, write_head
+    from skinlib.training import load_model
+
+    head = read_head(source)
+    locked = _locked_bones(head, lock, source)
+    if max_influences is not None and max_influences < 1:
+        raise HeadError(
+            "--max-influences", f"{max_influences}", "give 1 or more", source
+        )
+    weights = load_model(checkpoint).predict(head)
+    weights = finish(head, weights, locked, symmetric, max_influences)
+    both_glb = source.suffix.lower() == target.suffix.lower() == ".glb"
+    skinned = head.replace(weights=weights)
+    write_head(target, skinned, source=source if both_glb else None)
+    used = int((weights > 0).sum(axis=1).max())
+    print(
+        f"{target}: {len(head.vertices):,} vertices, {len(head.skeleton)} bones, "
+        f"at most {used} a vertex"
+    )
+
+
+def finish(
+    head: Head,
+    weights: np.ndarray,
+    locked: Sequence[int] = (),
+    symmetric: bool = False,
+    max_influences: int | None = None,
+) -> np.ndarray:
+    """(V, J) predicted weights made symmetric, limited, and with locked bones put back.
+
+    Locked bones take their influences first and the predicted ones share the rest.
+
+    Raises:
+        HeadError: a vertex needs more influences for its locked bones alone.
+    """
+    from skinlib.skinning import limit_influences, lock_bones, symmetrize
+
+    if symmetric:
+        weights = symmetrize(head, weights)
+    if max_influences is not None:
+        rank = np.array(weights)
+        if len(locked):
+            rank[:, locked] = 2 * (head.weights[:, locked] > 0)
+        kept = limit_influences(rank, max_influences) > 0
+        weights = np.where(kept, weights, 0)
+        weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
+    if len(locked):
+        weights = lock_bones(weights, head.weights, locked)
+    over = (weights > 0).sum(axis=1).max()
+    if max_influences is not None and over > max_influences:
+        raise HeadError(
+            "--max-influences",
+            f"the locked bones leave vertices with {over} influences",
+            f"allow {over}, or lock fewer bones",
+        )
+    return weights
+
+
+def _locked_bones(head: Head, names: Sequence[str], file: Path) -> list[int]:
+    unknown = [name for name in names if name not in head.skeleton.names]
+    if unknown:
+        raise HeadError(
+            "--lock",
+            f"no bone is called {', '.join(map(repr, unknown))}",
+            f"choose from {', '.join(head.skeleton.names)}",
+            file,
+        )
+    if names and head.weights is None:
+        raise HeadError(
+            "--lock",
+            "the head has no weights that could be kept",
+            "lock bones of a head that is skinned already",
+            file,
+        )
+    return [head.skeleton.names.index(name) for name in names]
+
+
+def train(
+    *,
+    labelled: Folder,
+    out: Folder,
+    unlabelled: OptionalFolder = None,
+    validation: OptionalFolder = None,
+    start: OptionalCheckpoint = None,
+    minutes: Annotated[float, arg(metavar="M")] = 30.0,
+    seed: Annotated[int, arg(metavar="S")] = 0,
+    device: Annotated[str, arg(metavar="D")] = "cpu",
+    threads: Annotated[int, arg(metavar="T")] = min(2, os.cpu_count() or 1),
+) -> None:
+    """Train a network on heads that you have skinned.
+
+    The best network so far is kept in OUT all the time. Ctrl-C stops; the same command
+    goes on where it stopped. Twenty heads are a start; heads with different meshes
+    teach more than many sculpts of one mesh.
+
+    For example:
+      skinlib train --labelled my_heads --out runs/mine --start default --minutes 10
+      skinlib train --labelled my_heads --out runs/scratch --minutes 30
+      skinlib skin new.glb skinned.glb --checkpoint runs/mine
+
+    Args:
+        labelled: Folder of skinned heads (.glb, .gltf, .npz).
+        out: Folder that the network is written to; made when there is none.
+        unlabelled: Folder of heads without weights, to learn shapes from.
+        validation: Folder of skinned heads to judge by; else some meshes of LABELLED.
+        start: Begin with this network and adapt it, instead of from nothing.
+        minutes: How long to train.
+        seed: Same seed, same start.
+        device: Where to compute, such as cpu or cuda.
+        threads: CPU cores to use.
+    """
+    from skinlib import training
+    from skinlib.datasets.folder import load_folder
+
+    if minutes <= 0:
+        raise HeadError("--minutes", f"{minutes:g}", "give more than 0")
+    config = training.TrainConfig(
+        minutes=minutes, seed=seed, device=_device(device), threads=threads
+    )
+    model = training.load_model(start) if start else None
+    if model:
+        config = training.finetune_config(config)
+    training.train(
+        config,
+        load_folder(labelled),
+        out,
+        unlabelled=load_folder(unlabelled) if unlabelled else (),
+        validation=load_folder(validation) if validation else None,
+        start=model,
+    )
+    print(f"{out}: use it with `skinlib skin IN OUT --checkpoint {out}`")
+
+
+def _device(name: str) -> str:
+    import torch
+
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise HeadError(
+            "--device",
+            f"{name!r} cannot be used here",
+            "take cpu; see `skinlib check` for what torch finds",
+        ) from error
+    return name
+
+
+def evaluate(
+    *,
+    heads: Folder,
+    train_heads: OptionalFolder = None,
+    checkpoint: Checkpoint = DEFAULT_CHECKPOINT,
+    json_file: Annotated[Path | None, arg(name="json", metavar="FILE")] = None,
+) -> None:
+    """Compare our weights with what riggers use today, on heads that you have skinned.
+
+    row-L1 is how much of a vertex's weight sits on wrong bones: 0 perfect, 2 all wrong.
+    Heads that the network was trained on flatter it; judge by others.
+
+    For example:
+      skinlib evaluate --heads test_heads
+      skinlib evaluate --heads test_heads --train-heads my_heads --json scores.json
+
+    Args:
+        heads: Folder of skinned heads to predict and to compare with.
+        train_heads: Folder of skinned heads that the template methods may copy from.
+        checkpoint: A shipped network, or a folder that `skinlib train` wrote.
+        json_file: Also write every number there.
+    """
+    from skinlib.datasets.folder import load_folder
+    from skinlib.evaluate import compare
+    from skinlib.training import load_model
+
+    if json_file and not json_file.parent.is_dir():
+        raise HeadError(
+            "--json", "there is no such folder", "make it first", json_file.parent
+        )
+    scores = compare.evaluate(
+        load_folder(heads),
+        load_folder(train_heads) if train_heads else None,
+        load_model(checkpoint),
+    )
+    print(compare.format_table(scores))
+    if json_file:
+        json_file.write_text(json.dumps(scores, indent=1) + "\n")
+
+
+def demo(*, out: Folder = Path("demo")) -> None:
+    """Skin the sample head, print the scores, write a .glb and a picture.
+
+    Args:
+        out: Folder that the files are written to.
+    """
+    from skinlib.demo import run_demo
+
+    run_demo(out)
+
+
+def check() -> None:
+    """Say what works on this machine; a bug report wants to see it."""
+    from skinlib.check import run_checks
+
+    findings = run_checks()
+    print("\n".join(map(str, findings)))
+    if any(finding.status == "FAIL" for finding in findings):
+        sys.exit(1)
+
+
+COMMANDS = {
+    "skin": skin,
+    "train": train,
+    "evaluate": evaluate,
+    "demo": demo,
+    "check": check,
+}
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Run a command; bad input ends in one line on stderr and exit status 2."""
+    # The cores are shared with whatever else runs; threads that spin would take them.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="skinlib",
+            description="Head in, skinned head out.",
+            args=args,
+            config=(FlagCreatePairsOff,),
+        )
+    except (HeadError, OSError) as error:
+        print(f"skinlib: {error}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
+    except KeyboardInterrupt:
+        print("skinlib: stopped", file=sys.stderr)
+        sys.exit(INTERRUPTED)

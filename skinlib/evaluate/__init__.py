@@ -1,0 +1,1 @@
+"""How good skin weights are: metrics, the classical methods, and both side by side."""

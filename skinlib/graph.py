@@ -1,0 +1,201 @@
+"""The hybrid graph a mesh encoder runs on: mesh edges, and neighbours in space.
+
+Space alone is not to be trusted: closed lips touch, and a lid lies on its eye. So a
+neighbour in space becomes an edge only when the surface agrees that it is near.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from skinlib.geometry import islands, mesh_edges, safe_normalize, vertex_areas, weld
+from skinlib.head import Head
+
+MESH, SPACE = 0, 1
+
+
+@dataclass(frozen=True)
+class GraphConfig:
+    """How the hybrid graph is built."""
+
+    neighbours: int = 12  # edges a node keeps, mesh edges first; K
+    nearest: int = 8  # how many neighbours in space are candidates
+    min_cosine: float = 0.5  # least agreement of the two normals
+    max_detour: float = 1.6  # longest surface path, as a multiple of the straight line
+
+
+@dataclass(frozen=True, eq=False)
+class HybridGraph:
+    """A graph over N nodes; a node is a vertex, or several that a seam cut apart.
+
+    Attributes:
+        node_of_vertex: (V,) int64, the node of each vertex.
+        vertex_of_node: (N,) int64, one vertex of each node.
+        neighbours: (N, K) int64, nodes; an unused place repeats the first neighbour,
+            or the node itself when it has none, so a maximum over K needs no mask.
+        kinds: (N, K) int8, MESH or SPACE; -1 in an unused place.
+        island: (N,) int64, the connected piece of surface each node lies on.
+        edges: (E, 2) int64, mesh edges between nodes.
+    """
+
+    node_of_vertex: np.ndarray
+    vertex_of_node: np.ndarray
+    neighbours: np.ndarray
+    kinds: np.ndarray
+    island: np.ndarray
+    edges: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.vertex_of_node)
+
+    def vertex_edges(self, kind: int | None = None) -> np.ndarray:
+        """(E, 2) vertex ids of the graph's edges, all or of one kind, for drawing."""
+        used = self.kinds >= 0 if kind is None else self.kinds == kind
+        row, place = np.nonzero(used)
+        pairs = np.stack([row, self.neighbours[row, place]], axis=1)
+        return self.vertex_of_node[np.unique(np.sort(pairs, axis=1), axis=0)]
+
+
+def seam_nodes(head: Head) -> np.ndarray:
+    """(V,) int64: vertices that a seam cut apart share a node, 0 .. N-1.
+
+    Two vertices are one when they lie at the same position, both on an open border,
+    and their normals agree. Closed lips lie at the same position too, but they are no
+    border, or they face each other.
+    """
+    position = weld(head.vertices)
+    if position.max(initial=-1) + 1 == len(position):
+        return position
+    edges = np.sort(head.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    unique, uses = np.unique(edges, axis=0, return_counts=True)
+    border = np.zeros(len(position), bool)
+    border[unique[uses == 1]] = True
+    border[np.bincount(head.faces.ravel(), minlength=len(position)) == 0] = True
+
+    # Chain the vertices of one position in order; join neighbours in the chain.
+    order = np.argsort(position, kind="stable")
+    joins = []
+    for reach in (1, 2, 3):
+        a, b = order[:-reach], order[reach:]
+        same = (position[a] == position[b]) & border[a] & border[b]
+        facing = (head.normals[a] * head.normals[b]).sum(axis=1) > 0
+        joins.append(np.stack([a, b], axis=1)[same & facing])
+    joins = np.concatenate(joins)
+    count = len(position)
+    links = coo_matrix((np.ones(len(joins)), tuple(joins.T)), shape=(count, count))
+    return connected_components(links, directed=False)[1].astype(np.int64)
+
+
+def build_graph(head: Head, config: GraphConfig | None = None) -> HybridGraph:
+    """The hybrid graph of a head: O(V) time and memory.
+
+    Mesh edges come first, shortest first; the places left are filled with neighbours
+    in space, nearest first, that pass three gates: the same island, normals that agree,
+    and a path of at most two mesh edges not much longer than the straight line.
+
+    >>> from skinlib.head import Skeleton
+    >>> bone = Skeleton.from_heads_and_tails([[0, 0, 0]], None, [-1], ["head"])
+    >>> square = Head.create([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]],
+    ...                      [[0, 1, 2], [0, 2, 3]], bone)
+    >>> graph = build_graph(square)
+    >>> graph.vertex_edges(MESH).tolist()
+    [[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]
+    >>> graph.vertex_edges(SPACE).tolist()
+    [[1, 3]]
+    """
+    config = config or GraphConfig()
+    node_of_vertex = seam_nodes(head)
+    count = int(node_of_vertex.max()) + 1
+    vertex_of_node = np.full(count, -1)
+    vertex_of_node[node_of_vertex[::-1]] = np.arange(len(node_of_vertex))[::-1]
+    positions = head.vertices[vertex_of_node].astype(np.float64)
+    faces = node_of_vertex[head.faces]
+    edges = mesh_edges(faces)
+    normals = node_normals(head.normals, node_of_vertex, count)
+    island = islands(faces, count)
+
+    mesh, length = _mesh_table(positions, edges, config.neighbours)
+    table = np.where(np.isfinite(length), mesh, -1)
+    kinds = np.where(np.isfinite(length), MESH, -1).astype(np.int8)
+    space = _gated_nearest(positions, normals, island, mesh, length, config)
+    table, kinds = _append(table, kinds, space)
+    first = np.where(table[:, :1] >= 0, table[:, :1], np.arange(count)[:, None])
+    return HybridGraph(
+        node_of_vertex,
+        vertex_of_node,
+        np.where(kinds >= 0, table, first),
+        kinds,
+        island,
+        edges,
+    )
+
+
+def node_normals(normals, node_of_vertex, count) -> np.ndarray:
+    """(N, 3) float64 unit normals of nodes: the mean over a node's vertices."""
+    summed = [np.bincount(node_of_vertex, axis, count) for axis in normals.T]
+    return safe_normalize(np.stack(summed, axis=1), fallback=(0, 0, 1))
+
+
+def node_areas(head: Head, node_of_vertex: np.ndarray, count: int) -> np.ndarray:
+    """(N,) float64 surface area of nodes."""
+    return np.bincount(node_of_vertex, vertex_areas(head.vertices, head.faces), count)
+
+
+def _mesh_table(positions, edges, width):
+    """(N, K) mesh neighbours, shortest first, and (N, K) lengths, inf when unused."""
+    count = len(positions)
+    both = np.concatenate([edges, edges[:, ::-1]])
+    length = np.linalg.norm(positions[both[:, 0]] - positions[both[:, 1]], axis=1)
+    both_order = np.lexsort((both[:, 1], length, both[:, 0]))
+    both, length = both[both_order], length[both_order]
+    degree = np.bincount(both[:, 0], minlength=count)
+    place = np.arange(len(both)) - np.repeat(np.cumsum(degree) - degree, degree)
+    kept = place < width
+    row, place = both[kept, 0], place[kept]
+    neighbours = np.repeat(np.arange(count)[:, None], width, axis=1)
+    lengths = np.full((count, width), np.inf)
+    neighbours[row, place] = both[kept, 1]
+    lengths[row, place] = length[kept]
+    return neighbours, lengths
+
+
+def _gated_nearest(positions, normals, island, mesh, length, config, chunk=4096):
+    """(N, nearest) nodes that pass the gates, nearest first, -1 elsewhere."""
+    count = len(positions)
+    width = min(config.nearest + 1, count)
+    if width < 2:
+        return np.full((count, 0), -1)
+    straight, candidate = cKDTree(positions).query(positions, k=width)
+    own = np.arange(count)[:, None]
+    passed = (
+        (candidate != own)
+        & (island[candidate] == island[:, None])
+        & ((normals[candidate] * normals[:, None]).sum(axis=2) >= config.min_cosine)
+        & ~(mesh[:, None, :] == candidate[:, :, None]).any(axis=2)
+    )
+    for start in range(0, count, chunk):
+        rows, places = np.nonzero(passed[start : start + chunk])
+        rows += start
+        goal = candidate[rows, places]
+        # The shortest path of two mesh edges: meet at a common neighbour.
+        meet = mesh[rows][:, :, None] == mesh[goal][:, None, :]  # (P, K, K)
+        path = length[rows][:, :, None] + length[goal][:, None, :]
+        shortest = np.where(meet, path, np.inf).min(axis=(1, 2), initial=np.inf)
+        far = shortest > config.max_detour * straight[rows, places]
+        passed[rows[far], places[far]] = False
+    return np.where(passed, candidate, -1)
+
+
+def _append(table, kinds, extra):
+    """Fill the unused places of `table` with the used ones of `extra`."""
+    width = table.shape[1]
+    table = np.concatenate([table, extra], axis=1)
+    kinds = np.concatenate([kinds, np.where(extra >= 0, SPACE, -1)], axis=1)
+    order = np.argsort(table < 0, axis=1, kind="stable")[:, :width]
+    return (
+        np.take_along_axis(table, order, axis=1),
+        np.take_along_axis(kinds, order, axis=1).astype(np.int8),
+    )

@@ -1,0 +1,310 @@
+"""Heads in and out of files: `.npz` and skinned glTF 2.0 (`.glb`, and `.gltf` to read).
+
+A `.npz` holds the arrays of the data contract under the names in `NPZ_KEYS`; what is
+read of a glTF file, and how, is told in `skinlib.gltf`.
+"""
+
+import contextlib
+import math
+import os
+import uuid
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from skinlib import gltf
+from skinlib.head import Head, HeadError, Skeleton
+
+NPZ_KEYS = (
+    "vertices",
+    "faces",
+    "normals",
+    "bone_names",
+    "bone_parents",
+    "bone_heads",
+    "bone_tails",
+    "weights",
+)
+NPZ_OPTIONAL = {"normals", "bone_tails", "weights"}
+
+
+def read_head(path: str | Path) -> Head:
+    """Read a head from a `.npz`, `.glb` or `.gltf` file; its name is the file's stem.
+
+    Raises:
+        HeadError: the file cannot be read, or what it holds is not a head.
+    """
+    readers = {".npz": read_npz, ".glb": read_glb, ".gltf": read_glb}
+    return _by_suffix(readers, path)(path)
+
+
+def write_head(
+    path: str | Path,
+    head: Head,
+    source: str | Path | None = None,
+    max_influences: int | None = None,
+) -> None:
+    """Write a head to a `.npz` or `.glb` file; the file appears whole or not at all.
+
+    Args:
+        path: where to; a file that is there already is replaced.
+        head: what to write.
+        source: a `.glb` file to re-skin: everything in it is kept (materials, morph
+            targets, animations, other meshes, ...) and the weights of `head` are put
+            on its mesh. `head` must have its vertices and its bones.
+        max_influences: keep this many of a vertex's largest weights; None keeps all.
+
+    Raises:
+        HeadError: the file cannot be written, or `head` does not fit `source`.
+    """
+    write = _by_suffix({".npz": write_npz, ".glb": write_glb}, path)
+    if source is None:
+        write(path, head, max_influences=max_influences)
+    elif write is write_glb:
+        write_glb(path, head, source=source, max_influences=max_influences)
+    else:
+        raise HeadError(
+            "file",
+            f"the source {source} cannot be re-skinned into a .npz file",
+            "give the output a name that ends in .glb, or leave the source out",
+            path,
+        )
+
+
+def _by_suffix(functions: dict[str, Callable], path: str | Path) -> Callable:
+    suffix = Path(path).suffix.lower()
+    if suffix not in functions:
+        raise HeadError(
+            "file",
+            f"the name ends in {suffix!r}" if suffix else "the name has no ending",
+            f"use one of {', '.join(functions)}",
+            path,
+        )
+    return functions[suffix]
+
+
+# --- .npz ---------------------------------------------------------------------------
+
+
+def read_npz(path: str | Path) -> Head:
+    """Read a head from a `.npz` file with the arrays `NPZ_KEYS`; pickles are refused.
+
+    `normals`, `bone_tails` and `weights` may be absent.
+
+    Raises:
+        HeadError: the file cannot be read, or what it holds is not a head.
+    """
+    path = _existing_file(path)
+    if not zipfile.is_zipfile(path):
+        raise HeadError(
+            "file",
+            "it is not a .npz archive",
+            "write it again with numpy.savez, it may be cut off or a renamed pickle",
+            path,
+        )
+    with _malformed(path, "write the file again with numpy.savez_compressed"):
+        with zipfile.ZipFile(path) as archive:
+            arrays = {key: _npz_array(archive, key, path) for key in NPZ_KEYS}
+        names, heads = arrays["bone_names"], arrays["bone_heads"]
+        if names.shape != heads.shape[:1] or names.dtype.kind not in "US":
+            raise HeadError(
+                "bone_names",
+                f"{names.dtype} values of shape {names.shape}",
+                "store one string per row of bone_heads",
+                path,
+            )
+        if names.dtype.kind == "S":
+            names = np.char.decode(names, "utf-8")
+        return Head.create(
+            arrays["vertices"],
+            arrays["faces"],
+            Skeleton.from_heads_and_tails(
+                heads,
+                arrays["bone_tails"],
+                arrays["bone_parents"],
+                _checked_names(names.tolist(), path),
+                file=path,
+            ),
+            weights=arrays["weights"],
+            normals=arrays["normals"],
+            name=path.stem,
+            file=path,
+        )
+
+
+def _npz_array(archive: zipfile.ZipFile, key: str, path: Path) -> np.ndarray | None:
+    """One array of the archive; its header is judged before memory is taken."""
+    try:
+        member = archive.getinfo(f"{key}.npy")
+    except KeyError:
+        if key in NPZ_OPTIONAL:
+            return None
+        raise HeadError(
+            key, "it is missing", f"save the arrays {', '.join(NPZ_KEYS)}", path
+        ) from None
+    with archive.open(member) as file:
+        version = np.lib.format.read_magic(file)
+        if version == (1, 0):
+            shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+        else:
+            shape, _, dtype = np.lib.format.read_array_header_2_0(file)
+    if dtype.hasobject:
+        raise HeadError(
+            key,
+            "it holds pickled Python objects, which can run code when they are read",
+            "save numbers and strings only: dtype=object is refused",
+            path,
+        )
+    elements = math.prod(shape)
+    if elements > gltf.MAX_ELEMENTS or elements * dtype.itemsize > member.file_size:
+        raise HeadError(
+            key,
+            f"it claims the shape {shape}",
+            f"store at most {gltf.MAX_ELEMENTS} numbers, and no fewer than it claims",
+            path,
+        )
+    with archive.open(member) as file:
+        return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def write_npz(path: str | Path, head: Head, max_influences: int | None = None) -> None:
+    """Write a head to a compressed `.npz` file with the arrays `NPZ_KEYS`.
+
+    Raises:
+        HeadError: the file cannot be written.
+    """
+    skeleton = head.skeleton
+    arrays = {
+        "vertices": head.vertices,
+        "faces": head.faces,
+        "normals": head.normals,
+        "bone_names": np.array(_checked_names(skeleton.names, path)),
+        "bone_parents": skeleton.parents,
+        "bone_heads": skeleton.joints,
+        "bone_tails": skeleton.tails,
+    }
+    if head.weights is not None:
+        bones, values = gltf.sorted_influences(head.weights, max_influences)
+        weights = np.zeros_like(head.weights)
+        np.add.at(weights, (np.arange(len(weights))[:, None], bones), values)
+        arrays["weights"] = weights
+    with _atomic(path) as file:
+        np.savez_compressed(file, **arrays)
+
+
+# --- glTF ---------------------------------------------------------------------------
+
+
+def read_glb(path: str | Path) -> Head:
+    """Read a head from a `.glb` file, or from a `.gltf` file and what lies beside it.
+
+    All meshes bound to the same skin become one head; its vertices are those of their
+    primitives, one after the other. Meshes without a skin are passed over when there is
+    one with a skin. `weights` is None when no vertex has any.
+
+    Raises:
+        HeadError: the file cannot be read, or does not hold one head with joints.
+    """
+    path = _existing_file(path)
+    with _malformed(path, "export it again as binary glTF 2.0"):
+        return gltf.read(path)
+
+
+def write_glb(
+    path: str | Path,
+    head: Head,
+    source: str | Path | None = None,
+    max_influences: int | None = None,
+) -> None:
+    """Write a head to a `.glb` file; see `write_head`.
+
+    Influences are sorted, largest first, four to a JOINTS_n/WEIGHTS_n pair.
+
+    Raises:
+        HeadError: the file cannot be written, or `head` does not fit `source`.
+    """
+    _checked_names(head.skeleton.names, path)
+    if source is None:
+        content = gltf.new_file(head, max_influences)
+    else:
+        source = _existing_file(source)
+        with _malformed(source, "export it again as binary glTF 2.0"):
+            content = gltf.reskinned(source, head, max_influences)
+    with _atomic(path) as file:
+        file.write(content)
+
+
+# --- files --------------------------------------------------------------------------
+
+
+def _existing_file(path: str | Path) -> Path:
+    path = Path(path)
+    try:
+        if path.is_dir():
+            found, fix = "it is a folder", "give the name of a file in it"
+        elif not path.is_file():
+            found, fix = "there is no such file", "check the name and the folder"
+        else:
+            with path.open("rb"):
+                return path
+    except OSError as error:
+        found, fix = f"it cannot be read ({error.strerror})", "check its permissions"
+    raise HeadError("file", found, fix, path)
+
+
+@contextlib.contextmanager
+def _malformed(path: Path, fix: str) -> Iterator[None]:
+    """Make a HeadError of whatever the libraries raise on a malformed file."""
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    except HeadError:
+        raise
+    except Exception as error:
+        found = f"its content is malformed ({type(error).__name__}: {str(error)[:200]})"
+        raise HeadError("file", found, fix, path) from error
+
+
+@contextlib.contextmanager
+def _atomic(path: str | Path) -> Iterator[BinaryIO]:
+    """A file to write to, which becomes `path` when all went well."""
+    path = Path(path)
+    if path.is_dir():
+        raise HeadError("file", "it is a folder", "give the name of a file", path)
+    part = path.parent / f".{uuid.uuid4().hex}.part"
+    try:
+        with part.open("xb") as file:
+            yield file
+        os.replace(part, path)
+    except OSError as error:
+        raise HeadError(
+            "file",
+            f"it cannot be written ({error.strerror})",
+            "choose a folder that exists, may be written to and has space",
+            path,
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()
+
+
+def _checked_names(names, path: str | Path) -> list[str]:
+    """Names that every format can hold."""
+    for name in names:
+        try:
+            name.encode()
+        except UnicodeEncodeError:
+            sound = False
+        else:
+            sound = "\0" not in name
+        if not sound:
+            raise HeadError(
+                "bone_names",
+                f"{name!r} is not Unicode text",
+                "rename the bone without NUL characters and lone surrogates",
+                path,
+            )
+    return list(names)

@@ -1,0 +1,152 @@
+"""From a head to what the network reads, in the head's own frame."""
+
+import hashlib
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from skinlib.geometry import canonical_frame, curvature, normal_deviation
+from skinlib.graph import GraphConfig, build_graph, node_areas, node_normals
+from skinlib.head import Head
+
+# Curvature is 1 / radius; a lid or a lip bends about 10 times as much as the skull.
+CURVATURE_UNIT = 10.0
+CACHE_VERSION = "1"
+
+
+@dataclass(frozen=True)
+class _Tensors:
+    def to(self, device: torch.device | str) -> Self:
+        """A copy on another device."""
+        return type(self)(*(getattr(self, f.name).to(device) for f in fields(self)))
+
+
+@dataclass(frozen=True)
+class MeshInput(_Tensors):
+    """What the mesh encoder reads: N nodes with K neighbours, over V vertices.
+
+    Positions are in the head's frame (`canonical_frame`), so they have no unit.
+    """
+
+    positions: Tensor  # (N, 3)
+    normals: Tensor  # (N, 3), unit
+    curvature: Tensor  # (N,), squashed to -1 .. 1
+    deviation: Tensor  # (N,), 0 .. 2
+    areas: Tensor  # (N,), share of the surface, mean 1
+    neighbours: Tensor  # (N, K) int64
+    used: Tensor  # (N, K) bool, False where `neighbours` only fills the table
+    island: Tensor  # (N,) int64
+    node_of_vertex: Tensor  # (V,) int64
+
+
+@dataclass(frozen=True)
+class SkeletonInput(_Tensors):
+    """What the skeleton encoder reads: J bones in the head's frame."""
+
+    joints: Tensor  # (J, 3)
+    directions: Tensor  # (J, 3), unit or 0
+    lengths: Tensor  # (J,)
+    parents: Tensor  # (J,) int64, -1 for a root
+    depths: Tensor  # (J,) int64
+
+    @property
+    def tails(self) -> Tensor:
+        """(J, 3) bone ends."""
+        return self.joints + self.lengths[:, None] * self.directions
+
+
+def prepare(
+    head: Head, config: GraphConfig | None = None, cache: Path | None = None
+) -> tuple[MeshInput, SkeletonInput]:
+    """Everything the network reads of a head.
+
+    Args:
+        cache: a folder that keeps the result under the hash of the head's content, so
+            that the graph of a mesh is built once.
+    """
+    config = config or GraphConfig()
+    if cache is None:
+        return _prepare(head, config)
+    path = Path(cache) / f"{content_hash(head, config)}.safetensors"
+    if path.exists():
+        stored = load_file(path)
+        return tuple(
+            kind(*(stored[f"{kind.__name__}.{f.name}"] for f in fields(kind)))
+            for kind in (MeshInput, SkeletonInput)
+        )
+    prepared = _prepare(head, config)
+    flat = {
+        f"{type(part).__name__}.{f.name}": getattr(part, f.name).contiguous()
+        for part in prepared
+        for f in fields(part)
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(f".{np.random.default_rng().integers(2**32)}")
+    save_file(flat, partial)
+    partial.replace(path)
+    return prepared
+
+
+def content_hash(head: Head, config: GraphConfig) -> str:
+    """A name for a head's geometry: the same arrays have the same name everywhere."""
+    digest = hashlib.sha256(f"{CACHE_VERSION} {config}".encode())
+    skeleton = head.skeleton
+    for array in (head.vertices, head.normals, head.faces, skeleton.joints):
+        digest.update(str(array.shape).encode() + array.tobytes())
+    for array in (skeleton.parents, skeleton.lengths, skeleton.directions):
+        digest.update(array.tobytes())
+    return digest.hexdigest()[:32]
+
+
+def _prepare(head, config):
+    graph = build_graph(head, config)
+    return mesh_input(head, graph), skeleton_input(head)
+
+
+def _frame(head):
+    skeleton = head.skeleton
+    return canonical_frame(head.vertices, head.faces, skeleton.joints, skeleton.parents)
+
+
+def mesh_input(head: Head, graph) -> MeshInput:
+    """The mesh half; `graph` may come from an earlier pose of the same mesh."""
+    frame = _frame(head)
+    positions = frame.apply(head.vertices[graph.vertex_of_node])
+    normals = node_normals(head.normals, graph.node_of_vertex, len(graph))
+    normals = frame.rotate(normals)
+    bend = curvature(positions, normals, graph.edges) / CURVATURE_UNIT
+    areas = node_areas(head, graph.node_of_vertex, len(graph))
+    mean_area = areas.mean()
+    areas = areas / mean_area if mean_area > 0 else np.ones_like(areas)
+    return MeshInput(
+        _float(positions),
+        _float(normals),
+        _float(np.tanh(bend)),
+        _float(normal_deviation(normals, graph.edges)),
+        _float(areas),
+        torch.from_numpy(graph.neighbours),
+        torch.from_numpy(graph.kinds >= 0),
+        torch.from_numpy(graph.island),
+        torch.from_numpy(graph.node_of_vertex),
+    )
+
+
+def skeleton_input(head: Head) -> SkeletonInput:
+    """The skeleton half."""
+    frame, skeleton = _frame(head), head.skeleton
+    return SkeletonInput(
+        _float(frame.apply(skeleton.joints)),
+        _float(frame.rotate(skeleton.directions)),
+        _float(skeleton.lengths / frame.scale),
+        torch.from_numpy(np.array(skeleton.parents)),
+        torch.from_numpy(skeleton.depths),
+    )
+
+
+def _float(array) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))

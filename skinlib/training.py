@@ -1,0 +1,480 @@
+"""Training: heads in, a checkpoint out; it can be stopped at any step and goes on.
+
+Step s of a run depends on the seed, s and the parameters, on nothing else: each head is
+drawn, disturbed and differentiated by itself, on one thread, and the gradients are
+summed in a fixed order. So a run that was interrupted ends in the same bits as one that
+was not, and the number of threads changes the time, not the result.
+"""
+
+import copy
+import json
+import os
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from skinlib.datasets.augment import AugmentConfig, augment
+from skinlib.evaluate.groups import group_split
+from skinlib.evaluate.metrics import row_l1
+from skinlib.graph import GraphConfig, HybridGraph, build_graph
+from skinlib.head import Head, HeadError
+from skinlib.losses import LossWeights, supervised
+from skinlib.model import ModelConfig, SkinningModel
+from skinlib.model.inputs import mesh_input, skeleton_input
+from skinlib.paths import checkpoint
+
+STATE = "training.safetensors"
+WEIGHTS = "model.safetensors"
+CONFIG = "config.json"
+HISTORY = "history.json"
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """What a training run is; the same configuration and heads give the same model."""
+
+    minutes: float = 30.0  # training time, unless `steps` is given
+    steps: int | None = None  # number of steps, for runs that repeat to the bit
+    batch: int = 2  # heads a step
+    learning_rate: float = 1e-3  # of AdamW, after the warm-up
+    weight_decay: float = 0.01  # of AdamW
+    warmup: int = 100  # steps over which the learning rate rises
+    cooldown: float = 0.5  # last part of the run, in which the learning rate falls to 0
+    clip: float = 1.0  # largest norm of a step's gradient
+    ema: float = 0.998  # decay of the averaged parameters that are kept
+    seed: int = 0  # of parameters, order and augmentation
+    threads: int = min(2, os.cpu_count() or 1)  # heads differentiated at once
+    device: str = "cpu"  # cpu, cuda, cuda:1, ...
+    validation_share: float = 0.15  # of the heads, when no validation heads are given
+    validations: int = 20  # how often the run is validated
+    save_seconds: float = 60.0  # how often the state to resume from is written
+    unlabelled_share: float = 0.25  # of the draws, when unlabelled heads are given
+    unlabelled_start: float = 0.3  # part of the run after which they are drawn
+    model: ModelConfig = field(default_factory=ModelConfig)
+    loss: LossWeights = field(default_factory=LossWeights)
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+
+
+def train(
+    config: TrainConfig,
+    labelled: Sequence[Head],
+    out: str | Path,
+    unlabelled: Sequence[Head] = (),
+    validation: Sequence[Head] | None = None,
+    start: SkinningModel | None = None,
+) -> SkinningModel:
+    """Train a model and keep it, with all that is needed to go on, in `out`.
+
+    Called again with the same arguments after an interrupt it goes on where it was;
+    called after the end it returns the finished model.
+
+    Args:
+        labelled: heads with weights.
+        out: a folder; `load_model(out)` reads the best model so far at any time.
+        unlabelled: heads whose weights the averaged model guesses while it learns.
+        validation: heads to judge by; None holds out whole topology groups.
+        start: a model to begin from, such as a shipped checkpoint.
+
+    Raises:
+        HeadError: a head without weights, or `out` holds another run.
+        KeyboardInterrupt: passed on, after the state has been written.
+    """
+    return Trainer(config, labelled, out, unlabelled, validation, start).run()
+
+
+class Trainer:
+    """One training run; see `train`. `step()` is one step, for a look inside."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        labelled: Sequence[Head],
+        out: str | Path,
+        unlabelled: Sequence[Head] = (),
+        validation: Sequence[Head] | None = None,
+        start: SkinningModel | None = None,
+    ):
+        labelled = list(labelled)
+        _check_labelled(labelled)
+        if validation is None:
+            train_ids, held_out = group_split(
+                labelled, config.validation_share, config.seed
+            )
+            validation = [labelled[i] for i in held_out]
+            labelled = [labelled[i] for i in train_ids]
+        self.config, self.out = config, Path(out)
+        self.labelled, self.unlabelled = labelled, list(unlabelled)
+        self.validation = list(validation)
+        self.graphs: dict[int, HybridGraph] = {}
+
+        torch.manual_seed(config.seed)
+        self.model = SkinningModel(start.config if start else config.model)
+        if start:
+            self.model.load_state_dict(start.state_dict())
+        self.model.to(config.device)
+        self.average = copy.deepcopy(self.model).requires_grad_(False)
+        self.parameters = list(self.model.parameters())
+        self.optimizer = torch.optim.AdamW(
+            self.parameters,
+            lr=config.learning_rate,
+            weight_decay=config.weight_decay,
+            betas=(0.9, 0.98),
+        )
+        # What a resumed run needs beside the tensors.
+        self.steps_done, self.seconds = 0, 0.0
+        self.cooldown_start: int | None = None
+        if config.steps is not None:
+            self.cooldown_start = int(config.steps * (1 - config.cooldown))
+        self.best = float("inf")
+        self.history: list[dict] = []
+        self._pool = None
+        if (self.out / STATE).exists():
+            self._resume()
+
+    # -- the run -------------------------------------------------------------------
+
+    def run(self) -> SkinningModel:
+        """Train to the end of the budget and return the best model."""
+        self.out.mkdir(parents=True, exist_ok=True)
+        saved = time.monotonic()
+        with self._progress() as bar, ThreadPoolExecutor(self.config.threads) as pool:
+            self._pool = pool
+            try:
+                while not self.finished:
+                    began = time.monotonic()
+                    error = self.step()
+                    self.seconds += time.monotonic() - began
+                    self._show(bar, error)
+                    if self._validation_due():
+                        self.validate()
+                    if time.monotonic() - saved > self.config.save_seconds:
+                        self.save()
+                        saved = time.monotonic()
+            except KeyboardInterrupt:
+                self.save()
+                tqdm.write(f"Stopped; the same call goes on from {self.out / STATE}.")
+                raise
+            finally:
+                self._pool = None
+        if not self.history or self.history[-1]["step"] != self.steps_done:
+            self.validate()
+        self.save()
+        return load_model(self.out).to(self.config.device)
+
+    @property
+    def last_step(self) -> int | None:
+        """The step at which the run ends, once it is known."""
+        if self.config.steps is not None:
+            return self.config.steps
+        if self.cooldown_start is None:
+            return None
+        share = self.config.cooldown
+        return max(1, round(self.cooldown_start / max(1 - share, 1e-6)))
+
+    @property
+    def finished(self) -> bool:
+        """Whether the budget is spent."""
+        return self.last_step is not None and self.steps_done >= self.last_step
+
+    @property
+    def learning_rate(self) -> float:
+        """The learning rate of the next step: warm-up, constant, linear cool-down."""
+        rate = self.config.learning_rate
+        rate *= min(1.0, (self.steps_done + 1) / max(1, self.config.warmup))
+        if self.cooldown_start is not None and self.steps_done >= self.cooldown_start:
+            length = max(1, self.last_step - self.cooldown_start)
+            rate *= (self.last_step - self.steps_done) / length
+        return rate
+
+    def step(self) -> float:
+        """One step over `batch` heads; returns their mean row-L1."""
+        budget = self.config.minutes * 60 * (1 - self.config.cooldown)
+        if self.cooldown_start is None and self.seconds >= budget:
+            self.cooldown_start = max(1, self.steps_done)
+            if self.finished:
+                return float("nan")
+        first = self.steps_done * self.config.batch
+        draws = range(first, first + self.config.batch)
+        mapped = (self._pool.map if self._pool else map)(self._gradient, draws)
+        gradients, errors = zip(*mapped, strict=True)
+        for parameter, *parts in zip(self.parameters, *gradients, strict=True):
+            parameter.grad = sum(parts) / len(parts)
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.config.clip)
+        if not torch.isfinite(norm):
+            raise FloatingPointError(
+                f"the gradient of step {self.steps_done} is not finite: "
+                f"lower learning_rate ({self.config.learning_rate})"
+            )
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate
+        self.optimizer.step()
+        self.steps_done += 1
+        decay = min(self.config.ema, self.steps_done / (self.steps_done + 10))
+        with torch.no_grad():
+            pairs = zip(self.average.parameters(), self.parameters, strict=True)
+            for slow, fast in pairs:
+                slow.lerp_(fast, 1 - decay)
+        return float(np.mean(errors))
+
+    def _gradient(self, draw: int) -> tuple[tuple[Tensor, ...], float]:
+        """Gradient and row-L1 of one disturbed head; `draw` decides which and how."""
+        if self.config.device == "cpu":
+            torch.set_num_threads(1)
+        rng = np.random.default_rng([self.config.seed, 1, draw])
+        head, graph = self._draw(draw, rng)
+        head = augment(head, rng, self.config.augment)
+        mesh, skeleton = mesh_input(head, graph), skeleton_input(head)
+        target = torch.from_numpy(head.weights[graph.vertex_of_node])
+        device = self.config.device
+        logits = self.model.node_logits(mesh.to(device), skeleton.to(device))
+        loss = supervised(logits, target.to(device), self.config.loss)
+        error = (logits.detach().softmax(1).cpu() - target).abs().sum(1).mean()
+        return torch.autograd.grad(loss, self.parameters), error.item()
+
+    def _draw(self, draw: int, rng: np.random.Generator) -> tuple[Head, HybridGraph]:
+        """The head of a draw: labelled in shuffled epochs, or unlabelled and guessed."""
+        if self.unlabelled and self._progress_share() > self.config.unlabelled_start:
+            if rng.random() < self.config.unlabelled_share:
+                place = int(rng.integers(len(self.unlabelled)))
+                head = self.unlabelled[place]
+                graph = self._graph(len(self.labelled) + place, head)
+                return head.replace(weights=self._guess(head, graph)), graph
+        epoch, place = divmod(draw, len(self.labelled))
+        shuffle = np.random.default_rng([self.config.seed, 2, epoch])
+        place = int(shuffle.permutation(len(self.labelled))[place])
+        return self.labelled[place], self._graph(place, self.labelled[place])
+
+    @torch.no_grad()
+    def _guess(self, head: Head, graph: HybridGraph) -> np.ndarray:
+        """(V, J) weights that the averaged model gives an undisturbed head."""
+        device = self.config.device
+        mesh = mesh_input(head, graph).to(device)
+        return self.average(mesh, skeleton_input(head).to(device)).cpu().numpy()
+
+    def _graph(self, key: int, head: Head) -> HybridGraph:
+        if key not in self.graphs:
+            self.graphs[key] = build_graph(head, self.model.config.graph)
+        return self.graphs[key]
+
+    def _progress_share(self) -> float:
+        if self.config.steps is not None:
+            return self.steps_done / max(1, self.config.steps)
+        if self.last_step is not None:
+            return self.steps_done / self.last_step
+        return self.seconds / max(1e-9, self.config.minutes * 60)
+
+    def _progress(self):
+        if self.config.steps is not None:
+            return tqdm(total=self.config.steps, initial=self.steps_done, unit="step")
+        total, initial = round(self.config.minutes * 60), round(self.seconds)
+        return tqdm(total=total, initial=min(initial, total), unit="s")
+
+    def _show(self, bar, error: float) -> None:
+        self.recent = 0.98 * getattr(self, "recent", error) + 0.02 * error
+        done = self.steps_done if self.config.steps is not None else int(self.seconds)
+        bar.update(max(0, min(done, bar.total) - bar.n))
+        bar.set_postfix(
+            step=self.steps_done,
+            row_l1=f"{self.recent:.4f}",
+            best=f"{self.best:.4f}",
+            refresh=False,
+        )
+
+    # -- judging and keeping -------------------------------------------------------
+
+    def _validation_due(self) -> bool:
+        done = len(self.history) + 1
+        return self._progress_share() >= done / max(1, self.config.validations)
+
+    def validate(self) -> float:
+        """Row-L1 on the validation heads; the best model so far is kept."""
+        errors = [
+            float(row_l1(self.average.predict(head), head.weights).mean())
+            for head in self.validation
+        ]
+        error = float(np.mean(errors)) if errors else float("nan")
+        self.history.append(
+            {
+                "step": self.steps_done,
+                "minutes": round(self.seconds / 60, 3),
+                "train_row_l1": round(getattr(self, "recent", float("nan")), 5),
+                "validation_row_l1": round(error, 5),
+            }
+        )
+        if error < self.best or not errors:
+            self.best = error
+            trained = asdict(self.config) | {"model": self.average.describe()}
+            save_model(self.average, self.out, {"training": trained})
+        return error
+
+    def save(self) -> None:
+        """Write the state to resume from; a crash meanwhile leaves the older one."""
+        self.out.mkdir(parents=True, exist_ok=True)
+        tensors = {f"model.{k}": v for k, v in self.model.state_dict().items()}
+        tensors |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
+        for i, parameter in enumerate(self.parameters):
+            for key, value in self.optimizer.state[parameter].items():
+                tensors[f"optimizer.{i}.{key}"] = value
+        progress = {
+            "run": self._identity(),
+            "steps_done": self.steps_done,
+            "seconds": self.seconds,
+            "cooldown_start": self.cooldown_start,
+            "best": self.best,
+            "recent": getattr(self, "recent", None),
+            "history": self.history,
+        }
+        tensors = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
+        _write(self.out / STATE, tensors, {"progress": json.dumps(progress)})
+        _write_text(self.out / HISTORY, json.dumps(self.history, indent=1))
+
+    def _resume(self) -> None:
+        tensors, metadata = _read(self.out / STATE)
+        progress = json.loads(metadata["progress"])
+        if progress["run"] != self._identity():
+            differs = [
+                key
+                for key, value in self._identity().items()
+                if progress["run"].get(key) != value
+            ]
+            raise HeadError(
+                ", ".join(differs),
+                "another run, with other settings or heads, was begun here",
+                "continue it with the arguments it was begun with, or choose a new "
+                "folder for this one",
+                self.out,
+            )
+
+        def part(name):
+            prefix = f"{name}."
+            return {
+                key.removeprefix(prefix): value
+                for key, value in tensors.items()
+                if key.startswith(prefix)
+            }
+
+        self.model.load_state_dict(part("model"))
+        self.average.load_state_dict(part("average"))
+        for i, parameter in enumerate(self.parameters):
+            state = part(f"optimizer.{i}")
+            if state:
+                moments = {k: v.to(parameter.device) for k, v in state.items()}
+                moments["step"] = state["step"]
+                self.optimizer.state[parameter] = moments
+        self.steps_done, self.seconds = progress["steps_done"], progress["seconds"]
+        self.cooldown_start = progress["cooldown_start"]
+        self.best, self.history = progress["best"], progress["history"]
+        if progress["recent"] is not None:
+            self.recent = progress["recent"]
+
+    def _identity(self) -> dict:
+        """What has to be the same for a run to be the same."""
+        machine = ("threads", "device", "save_seconds")
+        settings = {k: v for k, v in asdict(self.config).items() if k not in machine}
+        heads = {
+            "labelled": [h.name for h in self.labelled],
+            "unlabelled": [h.name for h in self.unlabelled],
+            "validation": [h.name for h in self.validation],
+        }
+        return json.loads(json.dumps(settings | heads))
+
+
+def save_model(model: SkinningModel, folder: str | Path, extra: dict) -> None:
+    """Write `model.safetensors` and a readable `config.json` into a folder."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors = {k: v.cpu().contiguous() for k, v in model.state_dict().items()}
+    config = json.dumps({"model": model.describe()} | extra, indent=1)
+    # The weights carry their own configuration, so the two files cannot disagree.
+    _write(folder / WEIGHTS, tensors, {"config": config})
+    _write_text(folder / CONFIG, config + "\n")
+
+
+def load_model(name: str | Path) -> SkinningModel:
+    """The model of a shipped checkpoint, or of a folder that `train` wrote.
+
+    Args:
+        name: a folder, a `model.safetensors` file, or a name in `checkpoints/`.
+
+    Raises:
+        HeadError: there is no such checkpoint, or the file is damaged.
+    """
+    path = Path(name)
+    if path.is_dir() or path.parent != Path("."):
+        path = path if path.suffix == ".safetensors" else path / WEIGHTS
+    elif path.suffix != ".safetensors":
+        path = checkpoint(str(name)) / WEIGHTS
+    if not path.is_file():
+        raise HeadError(
+            "checkpoint",
+            "there is no such file",
+            "give the folder that `skinlib train --out` wrote, or a shipped name",
+            path,
+        )
+    tensors, metadata = _read(path)
+    try:
+        settings = json.loads(metadata["config"])["model"]
+        config = ModelConfig(**(settings | {"graph": GraphConfig(**settings["graph"])}))
+        model = SkinningModel(config)
+        model.load_state_dict(tensors)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise HeadError(
+            "checkpoint",
+            f"a file that is no skinlib model ({type(error).__name__})",
+            "use a model.safetensors that `skinlib train` wrote",
+            path,
+        ) from error
+    return model.eval()
+
+
+def finetune_config(config: TrainConfig, **changes) -> TrainConfig:
+    """A configuration for going on from a trained model: a tenth of the step size."""
+    return replace(config, learning_rate=config.learning_rate / 10, **changes)
+
+
+def _check_labelled(heads: Sequence[Head]) -> None:
+    if not heads:
+        raise HeadError(
+            "labelled", "there is no head to learn from", "give at least one head"
+        )
+    for head in heads:
+        if head.weights is None:
+            raise HeadError(
+                "weights",
+                f"head {head.name!r} has none",
+                "train on skinned heads; put heads without weights in --unlabelled",
+            )
+
+
+def _write(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
+    partial = path.with_suffix(".partial")
+    save_file(tensors, partial, metadata)
+    os.replace(partial, path)
+
+
+def _write_text(path: Path, text: str) -> None:
+    partial = path.with_suffix(".partial")
+    partial.write_text(text)
+    os.replace(partial, path)
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    try:
+        with safe_open(path, "pt") as file:
+            return {k: file.get_tensor(k) for k in file.keys()}, file.metadata() or {}
+    except (SafetensorError, OSError) as error:
+        raise HeadError(
+            "checkpoint",
+            f"it cannot be read ({error})",
+            "copy the file again, or delete it and train anew",
+            path,
+        ) from error

@@ -1,0 +1,291 @@
+import inspect
+import json
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from skinlib import check, cli, demo
+from skinlib.datasets.synthetic import synthetic_heads
+from skinlib.head import Head, HeadError, Skeleton
+from skinlib.io import read_head, write_head
+from skinlib.model import ModelConfig, SkinningModel
+from skinlib.skinning import symmetrize
+from skinlib.training import TrainConfig, load_model, save_model
+
+SMALL = ModelConfig(mesh_width=8, bone_width=8, blocks=1, points=2, tree_layers=1)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with three skinned heads, one unskinned, and a small network."""
+    folder = tmp_path_factory.mktemp("cli")
+    (folder / "heads").mkdir()
+    heads = synthetic_heads(3, seed=5, vertices=600)
+    for i, head in enumerate(heads):
+        write_head(folder / "heads" / f"head_{i}.npz", head)
+    write_head(folder / "skinned.glb", heads[0])
+    write_head(folder / "bare.npz", heads[0].replace(weights=None))
+    save_model(SkinningModel(SMALL), folder / "network", {})
+    return folder
+
+
+@pytest.fixture
+def run(place, monkeypatch):
+    """Run a command in `place`; returns its exit status."""
+    monkeypatch.chdir(place)
+
+    def run(*args) -> int:
+        try:
+            cli.main([str(arg) for arg in args])
+        except SystemExit as end:
+            return end.code
+        return 0
+
+    return run
+
+
+def skin(run, *args) -> np.ndarray:
+    assert run("skin", *args, "--checkpoint", "network") == 0
+    return read_head(args[1]).weights
+
+
+# ------------------------------------------------------------------------------- help
+
+
+@pytest.mark.parametrize(
+    "command, words",
+    [
+        ("skin", "IN OUT --checkpoint --max-influences --lock --symmetric skinned.glb"),
+        ("train", "--labelled --unlabelled --out --minutes --seed --device --start"),
+        ("evaluate", "--heads --train-heads --checkpoint --json row-L1"),
+        ("demo", "--out"),
+        ("check", "bug report"),
+    ],
+)
+def test_help_names_every_option(run, capsys, command, words):
+    assert run(command, "--help") == 0
+    text = capsys.readouterr().out
+    assert [word for word in words.split() if word not in text] == []
+
+
+def test_help_waits_for_no_slow_import():
+    code = (
+        "import sys; from skinlib import cli\n"
+        "try: cli.main(['skin', '--help'])\n"
+        "finally: print([m for m in ('torch', 'igl', 'vtk') if m in sys.modules])"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True
+    )
+    assert result.stdout.splitlines()[-1] == "[]"
+
+
+def test_the_defaults_are_those_of_the_library():
+    options = inspect.signature(cli.train).parameters
+    for name in ("minutes", "seed", "device", "threads"):
+        assert options[name].default == getattr(TrainConfig(), name)
+
+
+def test_python_m_skinlib_is_the_command(place):
+    command = [sys.executable, "-m", "skinlib", "skin", "no.glb", "out.glb"]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=place)
+    assert result.returncode == 2
+    assert result.stderr.startswith("skinlib: no.glb: ")
+    assert result.stderr.count("\n") == 1
+
+
+# ------------------------------------------------------------------------------- skin
+
+
+@pytest.mark.parametrize("source", ["bare.npz", "skinned.glb"])
+@pytest.mark.parametrize("target", ["out.npz", "out.glb"])
+def test_skin_writes_what_the_network_predicts(run, source, target):
+    weights = skin(run, source, target)
+    expected = load_model("network").predict(read_head(source))
+    np.testing.assert_allclose(weights, expected, atol=1e-6)
+
+
+def test_max_influences(run):
+    weights = skin(run, "bare.npz", "out.npz", "--max-influences", 2)
+    assert (weights > 0).sum(axis=1).max() == 2
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-6)
+
+
+def test_symmetric(run):
+    head = read_head("bare.npz")
+    predicted = load_model("network").predict(head)
+    weights = skin(run, "bare.npz", "out.npz", "--symmetric")
+    np.testing.assert_allclose(weights, symmetrize(head, predicted), atol=1e-6)
+
+
+def test_locked_bones_keep_their_weights(run):
+    head = read_head("heads/head_0.npz")
+    names = [head.skeleton.names[bone] for bone in (0, 2)]
+    weights = skin(run, "heads/head_0.npz", "out.npz", "--lock", *names)
+    assert np.array_equal(weights[:, [0, 2]], head.weights[:, [0, 2]])
+    assert not np.array_equal(weights, head.weights)
+
+
+@pytest.fixture
+def corner():
+    """A triangle on four bones; the artist used the first two."""
+    bones = Skeleton.from_heads_and_tails(np.eye(4, 3), None, [-1, 0, 0, 0], "abcd")
+    painted = np.tile([0.25, 0.5, 0.25, 0], (3, 1))
+    return Head.create(np.eye(3), [[0, 1, 2]], bones, painted)
+
+
+def test_a_locked_bone_takes_one_of_the_influences(corner):
+    predicted = np.tile([0.0, 0.25, 0.125, 0.625], (3, 1))
+    weights = cli.finish(corner, predicted, locked=[0], max_influences=2)
+    np.testing.assert_allclose(weights, np.tile([0.25, 0, 0, 0.75], (3, 1)))
+
+
+def test_an_unpainted_locked_bone_takes_none(corner):
+    predicted = np.tile([0.1, 0.2, 0.3, 0.4], (3, 1))
+    weights = cli.finish(corner, predicted, locked=[3], max_influences=2)
+    np.testing.assert_allclose(weights, np.tile([0, 0.4, 0.6, 0], (3, 1)))
+
+
+def test_locked_bones_that_need_more_influences_are_an_error(corner):
+    with pytest.raises(HeadError, match="leave vertices with 3 influences"):
+        cli.finish(corner, corner.weights, locked=[0, 1], max_influences=1)
+
+
+# ---------------------------------------------------------------------- train, evaluate
+
+
+def test_train_then_skin_with_it(run, place):
+    command = ("train", "--labelled", "heads", "--out", "new", "--threads", 1)
+    assert run(*command, "--start", "network", "--minutes", 0.005) == 0
+    assert run("skin", "bare.npz", "out.npz", "--checkpoint", "new") == 0
+    assert load_model("new").config == SMALL
+
+
+def test_ctrl_c_stops_and_the_state_is_kept(place):
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from skinlib import cli\n"
+        "cli.main('train --labelled heads --out stopped --start network'.split())"
+    )
+    training = subprocess.Popen(
+        [sys.executable, "-c", code], cwd=place, stderr=subprocess.PIPE, text=True
+    )
+    begun = ""
+    while "step=" not in begun:  # the progress bar shows the first steps
+        begun = (begun + training.stderr.read(1))[-40:]
+    training.send_signal(signal.SIGINT)
+    _, stderr = training.communicate(timeout=60)
+    assert training.returncode == 130
+    assert "Traceback" not in stderr
+    assert stderr.endswith("skinlib: stopped\n")
+    assert (place / "stopped" / "training.safetensors").is_file()
+
+
+def test_evaluate_writes_the_table_and_the_numbers(run, capsys):
+    status = run(
+        *("evaluate", "--heads", "heads", "--train-heads", "heads"),
+        *("--checkpoint", "network", "--json", "scores.json"),
+    )
+    assert status == 0
+    table = capsys.readouterr().out
+    with open("scores.json") as file:
+        methods = json.load(file)["methods"]
+    assert {"skinlib", "nearest_bone", "bone_heat", "template_copy"} <= methods.keys()
+    expected = {"row_l1_mean", "row_l1_p95", "row_l1_max", "precision", "recall"}
+    expected |= {"dominant_bone_accuracy", "seconds"}
+    for name, scores in methods.items():
+        assert name in table
+        assert scores["heads"].keys() == {"head_0", "head_1", "head_2"}
+        for row in [scores["mean"], *scores["heads"].values()]:
+            assert expected <= row.keys()
+
+
+# ------------------------------------------------------------------------------- errors
+
+
+@pytest.mark.parametrize(
+    "command, message",
+    [
+        ("skin no.glb out.glb", "no.glb: file"),
+        ("skin bare.npz out.fbx", "out.fbx"),
+        ("skin bare.npz out.npz --checkpoint ./nowhere", "nowhere"),
+        ("skin bare.npz out.npz --max-influences 0", "--max-influences"),
+        ("skin bare.npz out.npz --lock mouth_of_truth", "mouth_of_truth"),
+        ("skin bare.npz out.npz --lock head", "no weights that could be kept"),
+        ("skin bare.npz nowhere/out.npz", "nowhere"),
+        ("train --labelled nowhere --out new2", "nowhere"),
+        ("train --labelled heads --out new2 --device quantum", "quantum"),
+        ("train --labelled heads --out new2 --minutes -1", "--minutes"),
+        ("evaluate --heads network --checkpoint network", "network: folder"),
+        (
+            "evaluate --heads heads --checkpoint network --json no/where.json",
+            "no/where",
+        ),
+    ],
+)
+def test_bad_input_is_one_line_and_nothing_is_written(
+    run, place, capsys, command, message
+):
+    before = sorted(place.rglob("*"))
+    if "--checkpoint" not in command and command.startswith("skin"):
+        command += " --checkpoint network"
+    assert run(*command.split()) == 2
+    stderr = capsys.readouterr().err
+    assert message in stderr
+    assert stderr.splitlines()[-1].startswith("skinlib: ")
+    assert "Traceback" not in stderr
+    assert sorted(place.rglob("*")) == before
+
+
+# -------------------------------------------------------------------------- demo, check
+
+
+def test_demo(place, monkeypatch, capsys):
+    monkeypatch.setattr(demo, "DEFAULT_CHECKPOINT", str(place / "network"))
+    demo.run_demo(place / "demo")
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in ("skinlib", "bone_heat", "robust_transfer"))
+    artist = read_head(demo.sample(demo.HEAD))
+    written = read_head(place / "demo" / "adult_skinned.glb")
+    predicted = load_model(place / "network").predict(artist)
+    np.testing.assert_allclose(written.weights, predicted, atol=1e-6)
+    assert (place / "demo" / "demo.png").stat().st_size > 20_000
+
+
+def test_check_finds_bad_packages(monkeypatch):
+    lines = ["numpy>=1", "scipy>=99", "no-such>=1", 'nor-this; extra == "notebooks"']
+    monkeypatch.setattr(check, "requires", lambda name: lines)
+    found = {finding.what: finding.status for finding in check.package_findings()}
+    assert found == {
+        "numpy": "OK",
+        "scipy": "FAIL",
+        "no-such": "FAIL",
+        "nor-this": "NOTE",
+    }
+
+
+def test_check_finds_a_changed_sample(tmp_path, monkeypatch):
+    sums = tmp_path / "SHA256SUMS"
+    monkeypatch.setattr(
+        check, "repository_file", lambda _, *name: tmp_path.joinpath(*name)
+    )
+    # printf abc | sha256sum
+    digest = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    sums.write_text(f"{digest}  head.npz\n")
+    assert check._checksums("data_samples").status == "FAIL"
+    (tmp_path / "head.npz").write_bytes(b"abd")
+    assert "head.npz changed" in check._checksums("data_samples").detail
+    (tmp_path / "head.npz").write_bytes(b"abc")
+    assert check._checksums("data_samples").status == "OK"
+
+
+def test_check_ends_with_1_when_something_fails(run, monkeypatch, capsys):
+    findings = [check.Finding("OK", "numpy", "2"), check.Finding("NOTE", "vtk", "none")]
+    monkeypatch.setattr(check, "run_checks", lambda: findings)
+    assert run("check") == 0
+    findings.append(check.Finding("FAIL", "torch", "missing"))
+    assert run("check") == 1
+    assert capsys.readouterr().out.splitlines()[-1].startswith("FAIL  torch")
