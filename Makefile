@@ -40,7 +40,7 @@ lint: $(VENV)/installed
 	$(bin)/ruff format
 
 bench: $(VENV)/installed
-	$(bin)/python -m benchmarks
+	set -e; for file in benchmarks/*.py; do echo "== $$file"; $(bin)/python $$file; done
 
 clean:
 	rm -rf $(VENV) demo
@@ -50,7 +50,7 @@ clean:
 $(VENV)/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "skinlib needs Python 3.11 or newer: make PYTHON=python3.12 ..."; exit 1; }
-	test -x $(bin)/python || $(PYTHON) -m venv $(VENV)
+	test -x $(bin)/pip || $(PYTHON) -m venv $(VENV)
 	$(bin)/python -m pip install "$$(grep '^torch==' constraints.txt)" -c constraints.txt
 	$(bin)/python -m pip install -e '.[dev]' -c constraints.txt
 	touch $@

@@ -22,7 +22,6 @@ from typing import NoReturn
 
 import numpy as np
 import pygltflib
-from dataclasses_json import dataclass_json
 from scipy.spatial.transform import Rotation
 
 from skinlib.head import Head, HeadError, Skeleton
@@ -42,13 +41,11 @@ def read(path: Path) -> Head:
 
 # pygltflib leaves out two properties of the specification, which would be lost when a
 # file is re-skinned.
-_Node = dataclass_json(
-    make_dataclass(
-        "_Node", [("weights", list[float] | None, None)], bases=(pygltflib.Node,)
-    )
+_Node = make_dataclass(
+    "_Node", [("weights", list[float] | None, None)], bases=(pygltflib.Node,)
 )
-_Sampler = dataclass_json(
-    make_dataclass("_Sampler", [("name", str | None, None)], bases=(pygltflib.Sampler,))
+_Sampler = make_dataclass(
+    "_Sampler", [("name", str | None, None)], bases=(pygltflib.Sampler,)
 )
 _GLTF = make_dataclass(
     "_GLTF",
@@ -60,14 +57,14 @@ _GLTF = make_dataclass(
 )
 
 COMPONENTS = {
-    pygltflib.BYTE: "i1",
-    pygltflib.UNSIGNED_BYTE: "u1",
-    pygltflib.SHORT: "<i2",
-    pygltflib.UNSIGNED_SHORT: "<u2",
-    pygltflib.UNSIGNED_INT: "<u4",
-    pygltflib.FLOAT: "<f4",
+    pygltflib.BYTE: np.dtype("i1"),
+    pygltflib.UNSIGNED_BYTE: np.dtype("u1"),
+    pygltflib.SHORT: np.dtype("<i2"),
+    pygltflib.UNSIGNED_SHORT: np.dtype("<u2"),
+    pygltflib.UNSIGNED_INT: np.dtype("<u4"),
+    pygltflib.FLOAT: np.dtype("<f4"),
 }
-COMPONENT_TYPES = {np.dtype(name): component for component, name in COMPONENTS.items()}
+COMPONENT_TYPES = {dtype: component for component, dtype in COMPONENTS.items()}
 SHAPES = {
     "SCALAR": (),
     "VEC2": (2,),
@@ -186,7 +183,7 @@ class _Document:
         """The array at a bufferView + byteOffset, without a copy."""
         view = self.tree.bufferViews[_index(place.bufferView, self.tree.bufferViews)]
         buffer = self.buffers[_index(view.buffer, self.buffers)]
-        dtype = np.dtype(COMPONENTS[component])
+        dtype = COMPONENTS[component]
         size = dtype.itemsize * math.prod(shape[1:])
         stride = size if view.byteStride is None else operator.index(view.byteStride)
         start = operator.index(place.byteOffset or 0)
@@ -289,13 +286,20 @@ class _Document:
         return accessor_id
 
     def to_bytes(self) -> bytes:
-        blob = self.tree.binary_blob()
-        self.tree.buffers = [pygltflib.Buffer(byteLength=len(blob))]
-        for accessor in self.tree.accessors:
+        tree = self.tree
+        for accessor_id in self.free:
+            # Taking it out would shift all ids; an element of it costs nothing.
+            accessor = tree.accessors[accessor_id]
+            accessor.count, accessor.byteOffset = 1, 0
+            accessor.min, accessor.max = [], []
+            size = COMPONENTS[accessor.componentType].itemsize
+            tree.bufferViews[accessor.bufferView].byteLength = 4 * size
+        tree.buffers = [pygltflib.Buffer(byteLength=len(tree.binary_blob()))]
+        for accessor in tree.accessors:
             # The default 0 of pygltflib is not allowed without a bufferView.
             if accessor.bufferView is None:
                 accessor.byteOffset = None
-        return b"".join(self.tree.save_to_bytes())
+        return b"".join(tree.save_to_bytes())
 
 
 def _index(value: int, items: list) -> int:

@@ -232,6 +232,8 @@ class Trainer:
         rng = np.random.default_rng([self.config.seed, 1, draw])
         head, graph = self._draw(draw, rng)
         head = augment(head, rng, self.config.augment)
+        if not self.config.augment.keeps_mesh:
+            graph = build_graph(head, self.model.config.graph)
         mesh, skeleton = mesh_input(head, graph), skeleton_input(head)
         target = torch.from_numpy(head.weights[graph.vertex_of_node])
         device = self.config.device

@@ -143,3 +143,49 @@ def skinned_builder(weights_dtype: str = "f4") -> Builder:
         "meshes": [{"primitives": [primitive]}],
     }
     return builder
+
+
+def rich_builder() -> Builder:
+    """A file with one of everything that has to survive."""
+    builder = skinned_builder()
+    tree = builder.tree
+    image = builder.view(b"not really a PNG, but nobody looks inside")
+    primitive = tree["meshes"][0]["primitives"][0]
+    primitive["material"] = 0
+    primitive["attributes"]["TEXCOORD_0"] = builder.array(VERTICES[:, :2])
+    primitive["targets"] = [{"POSITION": builder.array(VERTICES / 10)}]
+    # The second set is not used by the first: it has to go all the same.
+    for i in (1, 2):
+        primitive["attributes"][f"JOINTS_{i}"] = builder.array(np.zeros((6, 4)), "u1")
+        primitive["attributes"][f"WEIGHTS_{i}"] = builder.array(np.zeros((6, 4)))
+    tree["meshes"][0] |= {"weights": [0.5], "extras": {"targetNames": ["smile"]}}
+    tree["nodes"][3]["weights"] = [0.25]
+    tree["nodes"].append({"name": "hat", "mesh": 1, "extras": {"colour": "red"}})
+    tree["scenes"][0]["nodes"].append(4)
+    tree["meshes"].append(
+        {"primitives": [{"attributes": {"POSITION": builder.array(VERTICES + 5)}}]}
+    )
+    times = builder.array([0, 1], min=[0], max=[1])
+    turns = builder.array([[0, 0, 0, 1], [0, 0, 0.6, 0.8]])
+    tree |= {
+        "asset": {"version": "2.0", "copyright": "somebody", "generator": "by hand"},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "images": [{"bufferView": image, "mimeType": "image/png", "name": "skin"}],
+        "samplers": [{"name": "smooth", "magFilter": 9729}],
+        "textures": [{"source": 0, "sampler": 0}],
+        "materials": [
+            {
+                "name": "skin",
+                "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}},
+                "extensions": {"KHR_materials_unlit": {}},
+            }
+        ],
+        "animations": [
+            {
+                "name": "nod",
+                "channels": [{"sampler": 0, "target": {"node": 1, "path": "rotation"}}],
+                "samplers": [{"input": times, "output": turns}],
+            }
+        ],
+    }
+    return builder

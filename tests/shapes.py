@@ -25,6 +25,13 @@ def sphere(subdivisions: int = 2, bones: int = 5, **options) -> Head:
     return Head.create(ball.vertices, ball.faces, skeleton(bones), **options)
 
 
+def bumpy(head: Head, part: float = 1e-3) -> Head:
+    """The head without the ties between distances that a perfect symmetry brings."""
+    centre, rng = head.vertices.mean(axis=0), np.random.default_rng(0)
+    noise = rng.normal(1, part, head.vertices.shape)
+    return head.replace(vertices=centre + (head.vertices - centre) * noise)
+
+
 def unwelded(head: Head) -> tuple[Head, np.ndarray]:
     """The head with three vertices of its own per face, and their old ids."""
     old = head.faces.ravel()

@@ -222,7 +222,7 @@ def test_evaluate_writes_the_table_and_the_numbers(run, capsys):
         ("evaluate --heads network --checkpoint network", "network: folder"),
         (
             "evaluate --heads heads --checkpoint network --json no/where.json",
-            "no/where",
+            "no: --json",
         ),
     ],
 )

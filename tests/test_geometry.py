@@ -202,7 +202,7 @@ def test_a_finer_mesh_has_the_same_frame():
         new = frame_of(Head.create(points, ids, head.skeleton))
         assert new.rotation.tolist() == old.rotation.tolist()
         np.testing.assert_allclose(new.centre, old.centre, atol=1e-3 * old.scale)
-        assert new.scale == pytest.approx(old.scale, rel=1e-3)
+        assert new.scale == pytest.approx(old.scale, rel=1e-2)
 
 
 def test_the_frame_does_not_depend_on_the_order_of_bones_or_vertices():

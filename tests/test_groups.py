@@ -7,7 +7,7 @@ from skinlib.head import Head, Skeleton
 BONE = Skeleton.from_heads_and_tails([[0, 0, 0]], None, [-1], ["head"])
 
 
-def edit(head, rng, cut=0.1):
+def edit(head, rng, cut=0.03):
     """Another character from the same mesh: sculpted, reordered, a region cut away."""
     vertices = head.vertices * rng.uniform(0.8, 1.2, 3)
     keep = vertices[head.faces].mean(axis=1) @ rng.standard_normal(3)

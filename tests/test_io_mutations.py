@@ -10,7 +10,15 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from gltf_files import FACES, JOINTS, VERTICES, WEIGHTS, skinned_builder, unpack
+from gltf_files import (
+    FACES,
+    JOINTS,
+    VERTICES,
+    WEIGHTS,
+    rich_builder,
+    skinned_builder,
+    unpack,
+)
 
 from skinlib.head import Head, HeadError, Skeleton
 from skinlib.io import read_head, write_head
@@ -204,5 +212,27 @@ def test_damaged_files_are_read_or_refused(tmp_path, originals):
             pytest.fail(f"file {number}{suffix}: {type(error).__name__}: {error}")
         assert time.perf_counter() - start < 5, f"file {number}{suffix} took too long"
     assert sum(outcomes.values()) >= 2000
-    # Neither all refused nor all accepted: the damage was of every kind.
+    # Neither all refused nor all accepted: the damage was of both kinds.
     assert min(outcomes.values()) > 100, outcomes
+
+
+def test_a_damaged_source_is_reskinned_or_refused(tmp_path):
+    tree, blob = unpack(rich_builder().write(tmp_path / "rich.glb"))
+    source, target = tmp_path / "source.glb", tmp_path / "target.glb"
+    rng = np.random.default_rng(0)
+    outcomes = Counter()
+    for _ in range(300):
+        source.write_bytes(glb(json.dumps(damage_tree(tree, rng)).encode(), blob))
+        target.unlink(missing_ok=True)
+        try:
+            head = read_head(source)
+            weights = np.eye(len(head.skeleton))[np.full(len(head.vertices), -1)]
+            write_head(target, head.replace(weights=weights), source=source)
+        except HeadError:
+            outcomes["refused"] += 1
+            assert not target.exists()
+        else:
+            outcomes["written"] += 1
+            np.testing.assert_array_equal(read_head(target).weights, weights)
+        assert {path.suffix for path in tmp_path.iterdir()} == {".glb"}
+    assert min(outcomes.values()) > 50, outcomes

@@ -20,7 +20,7 @@ from skinlib.evaluate.metrics import (
     symmetry_error,
 )
 from skinlib.head import Head, Skeleton
-from skinlib.skinning import descendants, find_bones, head_bone, mirror_pairs
+from skinlib.skinning import find_bones, head_bone, mirror_pairs
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_dominant_bone_and_iou():
 def strip():
     """Two flaps that meet at z = 0 in space only, one bone each, below a head bone."""
     skeleton = Skeleton.from_heads_and_tails(
-        [[0, 0, 0], [0, -1, 1], [0, 1, 1], [0, 9, 0]],
+        [[0, -9, 0], [0, -1, 1], [0, 1, 1], [0, 9, 0]],
         None,
         [-1, 0, 0, 0],
         ["head", "jaw", "nose", "crown"],
@@ -117,7 +117,7 @@ def test_one_connected_surface_has_no_seam():
     assert np.isnan(seam_bleed(head.weights, head.weights, head, jaw))
 
 
-# --- on a head with exact weights ------------------------------------------------------
+# --- on a head with exact weights -----------------------------------------------------
 
 
 def test_the_artist_scores_perfectly(head):
@@ -164,7 +164,7 @@ def test_order_of_bones_and_vertices_does_not_matter(head):
         head.weights[vertices][:, bones],
         head.normals[vertices],
     )
-    predicted = only(head, head_bone(head.skeleton)) / 2 + head.weights / 2
+    predicted = 0.4 * only(head, head_bone(head.skeleton)) + 0.6 * head.weights
     moved = predicted[vertices][:, bones]
     before = score(predicted, head.weights, head)
     after = score(moved, other.weights, other)
@@ -196,7 +196,10 @@ def test_errors_do_not_depend_on_the_unit(head):
         head.vertices * 100,
         head.faces,
         Skeleton.from_heads_and_tails(
-            skeleton.joints * 100, skeleton.tails * 100, skeleton.parents, skeleton.names
+            skeleton.joints * 100,
+            skeleton.tails * 100,
+            skeleton.parents,
+            skeleton.names,
         ),
         head.weights,
         head.normals,
@@ -234,7 +237,9 @@ def test_left_right_bleed_is_the_weight_of_the_wrong_side(head):
     swapped = head.weights[:, mirror_pairs(head.skeleton)]
     assert left_right_bleed(head.weights, head.weights, head) == 0
     assert left_right_bleed(swapped, head.weights, head) > 0.05
-    assert left_right_bleed(only(head, head_bone(head.skeleton)), head.weights, head) == 0
+    assert (
+        left_right_bleed(only(head, head_bone(head.skeleton)), head.weights, head) == 0
+    )
 
 
 def test_symmetry_error_of_a_one_sided_prediction(head):
@@ -258,9 +263,3 @@ def test_wrong_shapes_and_nan_are_refused(head):
     bad[0, 0] = np.nan
     with pytest.raises(ValueError, match="NaN"):
         score(bad, head.weights, head)
-
-
-def test_descendants_of_the_jaw_are_one_side_of_the_mouth(head):
-    jaw = descendants(head.skeleton, find_bones(head.skeleton, "jaw"))
-    names = {head.skeleton.names[bone] for bone in np.flatnonzero(jaw)}
-    assert names == {"jaw", "lip_lower"}

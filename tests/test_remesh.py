@@ -238,9 +238,25 @@ def test_a_cut_seam_is_closed_without_a_crack(remesh):
 
 @pytest.mark.parametrize("remesh", [halve, isotropic])
 def test_without_faces_one_clear_error(remesh):
-    points = Head.create(np.eye(3), [], two_bones())
-    with pytest.raises(HeadError, match="faces: there are none"):
-        remesh(points, 0)
+    no_faces = Head.create(np.eye(3), [], two_bones())
+    one_place = Head.create(np.ones((3, 3)), [[0, 1, 2]], two_bones())
+    for head in (no_faces, one_place):
+        with pytest.raises(HeadError, match="faces: there are none"):
+            remesh(head, 0)
+
+
+@REMESH
+def test_the_smallest_meshes(remesh):
+    triangle = Head.create(
+        np.eye(3), [[0, 1, 2]], two_bones(), [[1, 0], [0, 1], [0.5, 0.5]]
+    )
+    result = remesh(triangle, 0)
+    assert len(result.faces) >= 1
+    np.testing.assert_allclose(result.weights.sum(axis=1), 1, atol=1e-6)
+
+
+def test_isotropic_keeps_islands_too_small_for_their_share(bust):
+    assert island_count(isotropic(bust, 0, vertices=150)) == island_count(bust)
 
 
 def test_without_fast_simplification_one_clear_error(monkeypatch, mouth):

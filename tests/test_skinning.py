@@ -46,7 +46,7 @@ def random_rotations(rng, *shape):
     return q * np.sign(np.linalg.det(q))[..., None, None]
 
 
-# --- forward kinematics and linear blend skinning -----------------------------------
+# --- forward kinematics and linear blend skinning -------------------------------------
 
 
 def test_identity_pose_changes_nothing(head):
@@ -109,7 +109,7 @@ def test_a_pose_of_another_skeleton_is_refused(arm):
         forward_kinematics(arm, np.zeros((2, 3, 3)))
 
 
-# --- prune, limit, lock -----------------------------------------------------------------
+# --- prune, limit, lock ---------------------------------------------------------------
 
 
 def test_prune_keeps_the_largest_weight_always():
@@ -165,7 +165,7 @@ def test_lock_when_the_prediction_leaves_the_rest_nothing():
     np.testing.assert_array_equal(everything, original)
 
 
-# --- mirror -------------------------------------------------------------------------------
+# --- mirror ---------------------------------------------------------------------------
 
 
 def test_pairs_of_a_real_naming_habit():
@@ -203,7 +203,9 @@ def test_pairs_need_no_names_where_bones_differ_in_place(seed):
     assert (mirror_pairs(blank) == mirror_pairs(skeleton)).all()
 
 
-@pytest.mark.parametrize("joints", [[[1, 2, 3]], [[0, 0, 0], [0, 1, 0]], np.zeros((3, 3))])
+@pytest.mark.parametrize(
+    "joints", [[[1, 2, 3]], [[0, 0, 0], [0, 1, 0]], np.zeros((3, 3))]
+)
 def test_pairs_of_a_tiny_skeleton_are_a_permutation(joints):
     count = len(joints)
     skeleton = Skeleton.from_heads_and_tails(
@@ -252,10 +254,12 @@ def test_the_mirror_image_lies_on_the_mirrored_piece(head):
     mirrored = head.vertices * [-1, 1, 1]
     gap = np.linalg.norm(head.vertices[partner[found]] - mirrored[found], axis=1)
     assert gap.max() < 0.02 * np.ptp(head.vertices, axis=0).max()
-    assert ((head.normals[partner] * head.normals * [-1, 1, 1]).sum(axis=1)[found] > 0).all()
+    assert (
+        (head.normals[partner] * head.normals * [-1, 1, 1]).sum(axis=1)[found] > 0
+    ).all()
 
 
-# --- bones by name, preset poses --------------------------------------------------------
+# --- bones by name, preset poses ------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -294,7 +298,9 @@ def test_presets_move_the_right_way(up):
     def moved(name, part):
         transforms = forward_kinematics(head.skeleton, preset_pose(head, name))
         posed = linear_blend_skinning(head.vertices, head.weights, transforms)
-        return (posed - head.vertices)[head.weights[:, find_bones(head.skeleton, part)[0]] > 0.7]
+        return (posed - head.vertices)[
+            head.weights[:, find_bones(head.skeleton, part)[0]] > 0.7
+        ]
 
     assert moved("jaw_open", "jaw")[:, rise].mean() < 0
     turn = preset_pose(head, "head_turn")[head_bone(head.skeleton), :3, :3]
@@ -302,7 +308,10 @@ def test_presets_move_the_right_way(up):
     nose[front] = facing
     assert (turn @ nose)[0] == pytest.approx(0.5)  # 30 degrees to the person's left
     upper = upper_lids(head)
-    assert {head.skeleton.names[bone] for bone in upper} == {"lid_upper_L", "lid_upper_R"}
+    assert {head.skeleton.names[bone] for bone in upper} == {
+        "lid_upper_L",
+        "lid_upper_R",
+    }
     blink = forward_kinematics(head.skeleton, preset_pose(head, "blink"))
     posed = linear_blend_skinning(head.vertices, head.weights, blink)
     lids = head.weights[:, upper].sum(axis=1) > 0.7

@@ -153,7 +153,10 @@ def test_the_jaw_opens_the_mouth_and_leaves_the_skull(seed):
 
 def test_weights_do_not_know_the_mesh():
     """The same person with other triangles has the same weights at the same place."""
-    shape, options = HeadShape(), {"bones": 14, "unit": "m", "up": "y", "shuffle": False}
+    shape, options = (
+        HeadShape(),
+        {"bones": 14, "unit": "m", "up": "y", "shuffle": False},
+    )
     coarse, regions = synthetic_head_and_regions(1, 1000, shape=shape, **options)
     fine, others = synthetic_head_and_regions(1, 4000, shape=shape, **options)
     np.testing.assert_array_equal(coarse.skeleton.joints, fine.skeleton.joints)

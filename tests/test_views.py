@@ -93,6 +93,13 @@ def test_render_follows_size_after_size(head, painter):
     assert np.array_equal(scenes.render(head, size=SMALL), first)
 
 
+@pytest.mark.parametrize("side", [57, 58, 111, 143, 229])
+def test_render_has_exactly_the_size_asked_for(head, fallback, side):
+    assert scenes.render(head, size=(side, 2 * side)).shape == (2 * side, side, 3)
+    tile = np.zeros((side, side, 3), np.uint8)
+    assert picture_grid([tile], width=side + 16).image.shape[1] == side + 16
+
+
 def test_render_shows_the_pose(head, painter):
     open_jaw = scenes.pose_vertices(head, head.weights, {"jaw_open": 1.0})
     rest = scenes.render(head, size=SMALL)
@@ -395,7 +402,7 @@ def _ends(control):
     if hasattr(control, "min"):
         return [control.min, control.max]
     if hasattr(control, "options"):
-        return list(control.options)
+        return [o[1] if isinstance(o, tuple) else o for o in control.options]
     return [False, True]
 
 

@@ -61,6 +61,8 @@ def subdivide(head: Head, rng: np.random.Generator | int = 0) -> Head:
 def halve(head: Head, rng: np.random.Generator | int = 0, keep: float = 0.5) -> Head:
     """A share `keep` of the triangles, by quadric edge collapse.
 
+    A mesh of a few triangles, of which nothing would be left, stays as it is.
+
     Raises:
         HeadError: no faces, or `fast_simplification` is not installed.
     """
@@ -79,6 +81,8 @@ def halve(head: Head, rng: np.random.Generator | int = 0, keep: float = 0.5) -> 
     faces = source.faces.astype(np.int32)
     _, _, collapses = simplify(vertices, faces, 1 - keep, return_collapses=True)
     vertices, faces, patch = replay_simplification(vertices, faces, collapses)
+    if len(faces) == 0:
+        return source
     return shuffle(_carried(source, vertices, faces, patch), rng)
 
 
@@ -215,7 +219,6 @@ def _without_seams(head: Head) -> Head:
 
     Lips that touch share positions too, but their normals oppose each other.
     """
-    _needs_faces(head)
     place = weld(head.vertices)
     order = np.argsort(place, kind="stable")
     a, b = order[:-1], order[1:]  # neighbours in the sorted list cover each group
@@ -230,12 +233,13 @@ def _without_seams(head: Head) -> Head:
     _, first = np.unique(ids, return_index=True)
     faces = ids[head.faces]
     x, y, z = faces.T
-    return head.replace(
+    closed = head.replace(
         vertices=head.vertices[first],
         faces=faces[(x != y) & (y != z) & (z != x)],
-        normals=None,
         weights=None if head.weights is None else head.weights[first],
     )
+    _needs_faces(closed)
+    return closed
 
 
 def _voronoi_cells(head: Head, count: int, rng, iterations: int = 6) -> np.ndarray:
@@ -279,4 +283,6 @@ def _border(faces: np.ndarray) -> np.ndarray:
 
 def _needs_faces(head: Head) -> None:
     if len(head.faces) == 0:
-        raise HeadError("faces", "there are none", "remeshing needs a surface")
+        raise HeadError(
+            "faces", "there are none that span an area", "give a head with a surface"
+        )

@@ -266,13 +266,11 @@ def flip_edges(
     opposed = start[first] == end[second]  # else the two triangles face apart
     first, second = first[opposed], second[opposed]
     a, b, c, d = start[first], end[first], across[first], across[second]
-    usable = c != d
-    usable &= ~np.isin(
-        np.minimum(c, d) * np.int64(len(points)) + np.maximum(c, d), ordered
-    )
-    usable &= _convex_and_flat(points, a, b, c, d)
+    made = np.minimum(c, d) * np.int64(len(points)) + np.maximum(c, d)
+    usable = (c != d) & ~np.isin(made, ordered) & _convex_and_flat(points, a, b, c, d)
 
     picked = np.flatnonzero(usable)
+    picked = picked[np.unique(made[picked], return_index=True)[1]]  # each edge once
     picked = rng.permutation(picked)[: round(fraction * len(picked))]
     f, g = first[picked] % count, second[picked] % count
     # The first to claim a triangle has it.
@@ -310,6 +308,7 @@ class _Slit(NamedTuple):
     phi: float
     half_width: float  # c
     reach: float  # mu up to which the mesh has loops around it
+    tilt: float  # how fast the line through the corners rises beyond them
 
     def coordinates(self, theta, phi, side=0.0):
         """mu >= 0 and nu in (-pi, pi]; `side` +1 or -1 picks a lip on the slit."""
@@ -321,21 +320,18 @@ class _Slit(NamedTuple):
     def plane(self, theta, phi):
         """u to the person's left and v upwards, about arc lengths on the sphere."""
         return (phi - self.phi) * np.sin(self.theta), (
-            self.theta - theta - self._tilt(phi)
+            self.theta - theta - self._rise(phi)
         )
 
     def points(self, mu, nu):
         """theta, phi of elliptic coordinates."""
         w = self.half_width * np.cosh(mu + 1j * nu)
         phi = self.phi + w.real / np.sin(self.theta)
-        return self.theta - w.imag - self._tilt(phi), phi
+        return self.theta - w.imag - self._rise(phi), phi
 
-    def _tilt(self, phi):
-        # The line through the mouth's corners rises towards the ears, as a jaw does.
-        if self.phi != 0:
-            return np.zeros_like(phi)
+    def _rise(self, phi):
         corner = self.half_width / np.sin(self.theta)
-        return 0.25 * np.maximum(np.abs(phi) - corner, 0) ** 2
+        return self.tilt * np.maximum(np.abs(phi - self.phi) - corner, 0) ** 2
 
 
 class _Landmarks(NamedTuple):
@@ -346,8 +342,9 @@ class _Landmarks(NamedTuple):
     @classmethod
     def of(cls, shape: HeadShape) -> "_Landmarks":
         width = 1.4 * shape.eye_radius  # an eye opens a little wider than its ball
-        eye = _Slit(shape.eye_height, shape.eye_spacing, width, 0.75)
-        mouth = _Slit(shape.mouth_height, 0.0, shape.mouth_width, 0.5)
+        eye = _Slit(shape.eye_height, shape.eye_spacing, width, 0.75, 0.0)
+        # Beyond the mouth the line rises to the ears, as a jaw does.
+        mouth = _Slit(shape.mouth_height, 0.0, shape.mouth_width, 0.5, 0.25)
         return cls(mouth, eye, eye._replace(phi=-eye.phi))
 
     @property
@@ -389,7 +386,7 @@ def _triangulate(landmarks: _Landmarks, target: int, rng) -> _Mesh:
     """A random triangulation of the map with three slits, lined with inner lips."""
     style = rng.choice(["spiral", "scattered", "grid"])
     zoom = rng.uniform(1.1, 1.9)  # how much finer the face is than the nape
-    turn = Rotation.random(rng=rng).as_matrix()
+    turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
     size = 0.8 * target
     for _ in range(4):  # what the slits add grows with the rest
         theta, phi, chains = _scatter(landmarks, size, style, zoom, turn, rng)
@@ -757,7 +754,7 @@ def _eyeballs(shape, landmarks, count, rng):
     """(2 n, 3) points and (F, 3) faces of two balls of `count` vertices each."""
     points, faces = [], []
     for index, centre in enumerate(_eye_centres(shape, landmarks)):
-        ball = _spiral(count) @ Rotation.random(rng=rng).as_matrix().T
+        ball = _spiral(count) @ Rotation.from_quat(rng.normal(size=4)).as_matrix().T
         points.append(centre + shape.eye_radius * ball)
         faces.append(_hull_faces(ball) + index * count)
     return np.concatenate(points), np.concatenate(faces)

@@ -28,9 +28,12 @@ from skinlib.geometry import (
 )
 from skinlib.graph import seam_nodes
 from skinlib.head import Head, HeadError
+from skinlib.skinning import find_bones
 
 # Rows of distances computed at a time: bounds memory on meshes of a million vertices.
 CHUNK = 1 << 16
+# Joints further apart than this, relative to the head's size, are not the same joint.
+FAR = 0.5
 
 
 def nearest_bone(head: Head) -> np.ndarray:
@@ -52,10 +55,11 @@ def inverse_distance(head: Head, power: float = 4.0) -> np.ndarray:
 def bone_heat(head: Head) -> np.ndarray:
     """Heat equilibrium (Pinocchio; Baran and Popovic 2007): (-D + H) w_j = H p_j.
 
-    D is the cotangent Laplacian; p_j is 1 where bone j is the nearest; H = 1 / d^2, d
-    the distance to the nearest bone, or 0 where the mesh hides that bone from the
-    vertex. Seams are closed first. A piece of the mesh that sees no bone, where the
-    equation has no solution, follows the bone nearest to it as a whole.
+    D is the cotangent Laplacian; p_j is 1 where bone j is the nearest, 1/k where k
+    bones are; H = 1 / d^2, d the distance to the nearest bone, or 0 where the mesh
+    hides that bone from the vertex. Seams are closed first. A piece of the mesh that
+    sees no bone, where the equation has no solution, follows the bone nearest to it as
+    a whole.
     """
     node = seam_nodes(head)
     count = int(node.max()) + 1
@@ -77,13 +81,14 @@ def bone_heat(head: Head) -> np.ndarray:
 
     source = heat * vertex_areas(points, faces)
     source[seen & (source <= 0) & visible] = 1e-12  # a vertex of no face stands alone
-    p = sparse.csr_matrix(
-        (source, (np.arange(count), nearest)), shape=(count, len(bones))
-    )
+    p = distance <= distance.min(axis=1, keepdims=True) * (1 + 1e-4)
+    p = p / p.sum(axis=1, keepdims=True)
     system = sparse.diags(source + np.where(seen, 0, 1))
     if len(faces):
         system = system - igl.cotmatrix(points, faces)
-    weights = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A").solve(p.toarray())
+    weights = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A").solve(
+        source[:, None] * p
+    )
 
     blind = ~seen
     if blind.any():
@@ -184,28 +189,40 @@ def match_bones(template: Head, head: Head) -> BoneMatch:
     """Match a template's bones to the head's: by name, or else by place.
 
     Names count when at least half of the smaller rig's bones have one in common
-    (capitals and a prefix such as `rig:` do not matter). Otherwise joints are matched
-    one to one, as near as possible, in the two heads' own frames. A bone that is left
-    over gives its weight to the partner of its nearest matched ancestor, or to the
-    nearest joint.
+    (capitals and a prefix such as `rig:` do not matter); a bone without a namesake
+    gives its weight to its nearest ancestor that has one. Otherwise head and jaw, where
+    the names tell them, go to head and jaw, and the other joints are matched one to
+    one, as near as possible; a bone left over gives its weight to the nearest joint.
     """
     theirs, ours = template.skeleton, head.skeleton
+    gap = _in_common_frame(template, head)
+    nearest = gap.argmin(axis=1)
     place = {_plain(name): bone for bone, name in enumerate(ours.names)}
     target = np.array([place.get(_plain(name), -1) for name in theirs.names])
-    if 2 * (target >= 0).sum() < min(len(theirs), len(ours)):
-        gap = _in_common_frame(template, head)
-        rows, columns = linear_sum_assignment(gap)
-        # A match half a head away is none.
-        fits = gap[rows, columns] < 0.5
-        target = np.full(len(theirs), -1)
-        target[rows[fits]] = columns[fits]
     paired = target >= 0
-    nearest = _in_common_frame(template, head).argmin(axis=1)
-    for bone in theirs.order:
-        if target[bone] < 0:
-            parent = theirs.parents[bone]
-            target[bone] = target[parent] if parent >= 0 else nearest[bone]
-    return BoneMatch(target, paired)
+    if 2 * paired.sum() >= min(len(theirs), len(ours)):
+        for bone in theirs.order:
+            if not paired[bone]:
+                parent = theirs.parents[bone]
+                target[bone] = target[parent] if parent >= 0 else nearest[bone]
+        return BoneMatch(target, paired)
+
+    for _ in range(3):
+        for part in ("head", "jaw"):
+            a, b = find_bones(theirs, part)[:1], find_bones(ours, part)[:1]
+            if a and b:
+                gap[a], gap[:, b] = FAR, FAR
+                gap[a, b] = 0
+        rows, columns = linear_sum_assignment(gap)
+        fits = gap[rows, columns] < FAR
+        target, paired = nearest.copy(), np.zeros(len(theirs), bool)
+        target[rows[fits]], paired[rows[fits]] = columns[fits], True
+        match = BoneMatch(target, paired)
+        # The joints matched so far bring the others closer to theirs.
+        moved = _align(template, head, match)(theirs.joints)
+        gap = np.linalg.norm(moved[:, None] - ours.joints, axis=2) / _frame(head).scale
+        nearest = gap.argmin(axis=1)
+    return match
 
 
 def _plain(name: str) -> str:

@@ -283,16 +283,17 @@ def seam_bleed(
 ) -> float:
     """Mean |m^ - m| at a seam, m being a vertex's weight on `bones`: 0 .. 1.
 
-    The seam is where the artist's m jumps through the air: vertices with m > 3/4 that
-    have one with m < 1/4, or the other way round, closer than 5 % of the head's height
-    but more than twice as far along the surface. NaN when there is no such place.
+    The seam is where the artist's m jumps through the air: vertices with more than half
+    of the head's largest m that have one with less than a tenth of it, or the other way
+    round, closer than 5 % of the head's height but more than twice as far along the
+    surface. NaN when there is no such place.
 
     Args:
         bones: (J,) bool, the bones of one side.
     """
     mass = target[:, bones].sum(axis=1)
     reach = SEAM_WIDTH * head_height(head)
-    near, far = mass > 0.75, mass < 0.25
+    near, far = mass > 0.5 * mass.max(), mass < 0.1 * mass.max()
     seam = _across_air(head, near, far, reach) | _across_air(head, far, near, reach)
     if not seam.any():
         return float("nan")

@@ -7,6 +7,7 @@ from typing import Self
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -16,6 +17,9 @@ from skinlib.head import Head
 
 # Curvature is 1 / radius; a lid or a lip bends about 10 times as much as the skull.
 CURVATURE_UNIT = 10.0
+# Nothing that belongs to a head is further from it, in head radii; what is (a vertex left
+# behind, a bone in another unit) would overflow once squared.
+FAR = 1e3
 CACHE_VERSION = "1"
 
 
@@ -73,13 +77,14 @@ def prepare(
     if cache is None:
         return _prepare(head, config)
     path = Path(cache) / f"{content_hash(head, config)}.safetensors"
-    if path.exists():
+    try:
         stored = load_file(path)
         return tuple(
             kind(*(stored[f"{kind.__name__}.{f.name}"] for f in fields(kind)))
             for kind in (MeshInput, SkeletonInput)
         )
-    prepared = _prepare(head, config)
+    except (FileNotFoundError, SafetensorError, KeyError):
+        prepared = _prepare(head, config)  # not there yet, or damaged
     flat = {
         f"{type(part).__name__}.{f.name}": getattr(part, f.name).contiguous()
         for part in prepared
@@ -124,7 +129,7 @@ def mesh_input(head: Head, graph) -> MeshInput:
     mean_area = areas.mean()
     areas = areas / mean_area if mean_area > 0 else np.ones_like(areas)
     return MeshInput(
-        _float(positions),
+        _float(np.clip(positions, -FAR, FAR)),
         _float(normals),
         _float(np.tanh(bend)),
         _float(normal_deviation(normals, graph.edges)),
@@ -140,9 +145,9 @@ def skeleton_input(head: Head) -> SkeletonInput:
     """The skeleton half."""
     frame, skeleton = _frame(head), head.skeleton
     return SkeletonInput(
-        _float(frame.apply(skeleton.joints)),
+        _float(np.clip(frame.apply(skeleton.joints), -FAR, FAR)),
         _float(frame.rotate(skeleton.directions)),
-        _float(skeleton.lengths / frame.scale),
+        _float(np.minimum(skeleton.lengths.astype(float) / frame.scale, FAR)),
         torch.from_numpy(np.array(skeleton.parents)),
         torch.from_numpy(skeleton.depths),
     )

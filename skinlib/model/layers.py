@@ -39,15 +39,20 @@ def gather_max(values: Tensor, neighbours: Tensor) -> Tensor:
     """The largest value among each node's neighbours, channel by channel.
 
     Args:
-        values: (N, C). neighbours: (N', K) int64 rows of `values`, K <= 255.
+        values: (N, C). neighbours: (N', K) int64 rows of `values`, 1 <= K <= 256.
 
     Returns:
         (N', C).
+
+    Raises:
+        ValueError: more than 256 neighbours, which one byte cannot count.
 
     >>> gather_max(torch.tensor([[1.0], [5.0], [3.0]]), torch.tensor([[0, 2], [1, 0]]))
     tensor([[3.],
             [5.]])
     """
+    if not 1 <= neighbours.shape[1] <= 256:
+        raise ValueError(f"{neighbours.shape[1]} neighbours a node: use 1 to 256")
     return _GatherMax.apply(values, neighbours)
 
 
@@ -111,13 +116,13 @@ class GraphAttention(nn.Module):
         own = torch.arange(count, device=x.device)[:, None]
         table = torch.cat([neighbours, own], dim=1)  # (N, K + 1)
         used = torch.cat([used, torch.ones_like(own, dtype=torch.bool)], dim=1)
-        value = self.linear(x).view(count, self.heads, -1)  # (N, H, C / H)
+        value = self.linear(x).unflatten(1, (self.heads, -1))  # (N, H, C / H)
         received = (value * self.receiver).sum(2)  # (N, H)
         sent = (value * self.sender).sum(2)
         score = F.leaky_relu(received[:, None] + sent[table], 0.2)  # (N, K + 1, H)
         score = score.masked_fill(~used[..., None], -torch.inf).softmax(dim=1)
         mixed = torch.einsum("nkh,nkhc->nhc", score, value[table])
-        return self.activation(mixed.reshape(count, -1) + self.bias)
+        return self.activation(mixed.flatten(1) + self.bias)
 
 
 class Attention(nn.Module):

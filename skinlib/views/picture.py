@@ -120,6 +120,12 @@ def new_figure(width: float, height: float, layout: str | None = "constrained"):
         yield figure
 
 
+def pixel_figure(width: int, height: int):
+    """A figure of exactly so many pixels, without a layout."""
+    # matplotlib rounds down, and width / DPI * DPI may fall just short of width.
+    return new_figure((width + 0.01) / DPI, (height + 0.01) / DPI, layout=None)
+
+
 def rasterise(figure: Figure, caption: str = "", note: str | None = None) -> Picture:
     """The figure as a `Picture`; `note` is printed small below it."""
     if note:
@@ -199,7 +205,7 @@ def picture_grid(
     head_h = 0 if each_row else title_h
     height = round(top + head_h + rows * row_h + legend_h + foot)
 
-    with new_figure(width / DPI, height / DPI, layout=None) as figure:
+    with pixel_figure(width, height) as figure:
 
         def at(x, y):
             return x / width, 1 - y / height

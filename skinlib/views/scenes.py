@@ -31,14 +31,13 @@ from skinlib.graph import MESH, SPACE, HybridGraph, seam_nodes
 from skinlib.head import Head, Skeleton
 from skinlib.skinning import forward_kinematics, linear_blend_skinning, preset_pose
 from skinlib.views.picture import (
-    DPI,
     FAINT,
     INK,
     WEIGHT_MAP,
     ColourBar,
     Picture,
-    new_figure,
     picture_grid,
+    pixel_figure,
     rasterise,
 )
 
@@ -257,7 +256,7 @@ def _paint_matplotlib(points, faces, colours, normals, size) -> np.ndarray:
         facing = np.where(winding < 0, -1.0, 1.0)  # light both sides of a sheet
         facing = normals[faces] * facing[:, None, None]
         shaded = shaded * _lambert(facing.reshape(-1, 3))[:, None]
-    with new_figure(size[0] / DPI, size[1] / DPI, layout=None) as figure:
+    with pixel_figure(*size) as figure:
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()
         axes.set_xlim(-size[0] / size[1], size[0] / size[1])
@@ -293,9 +292,12 @@ def _paint_vtk(points, faces, colours, normals, size) -> np.ndarray:
     )
     actor.prop.interpolation = "Phong"
     camera = plotter.camera
-    camera.position, camera.focal_point, camera.up = (0, 0, 500), (0, 0, 0), (0, 1, 0)
+    near = float(points[:, 2].max()) + 1
+    camera.position, camera.up = (0, 0, near), (0, 1, 0)
+    camera.focal_point = (0, 0, near - 1)
     camera.parallel_projection, camera.parallel_scale = True, 1.0
-    camera.clipping_range = (1, 1000)
+    # As tight as the head is deep: closed lips are told apart by the depth buffer.
+    camera.clipping_range = (0.5, near - float(points[:, 2].min()) + 0.5)
     plotter.suppress_rendering = False
     plotter.render()
     return plotter.screenshot(return_img=True)[..., :3]
@@ -352,7 +354,8 @@ def _show_interactive(
     normals = _normals(head, vertices) @ camera.rotation.T
     plotter = pyvista.Plotter(window_size=SIZE)
     mesh = _polydata(placed, head.faces, np.clip(colours, 0, 1), normals)
-    plotter.add_mesh(mesh, scalars="colours", rgb=True)
+    actor = plotter.add_mesh(mesh, scalars="colours", rgb=True)
+    actor.prop.interpolation = "Phong"
     plotter.view_xy()
     display(plotter.show(jupyter_backend="trame", return_viewer=True))
 
@@ -615,7 +618,7 @@ def show_skeleton(
     side = 150 if labels else 0
     width, height = size[0] + 2 * side, size[1] + 34
 
-    with new_figure(width / DPI, height / DPI, layout=None) as figure:
+    with pixel_figure(width, height) as figure:
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()
         axes.set_xlim(-side, size[0] + side)
@@ -705,7 +708,7 @@ def show_graph(
 
     heading = title or f"{head.name or 'head'}: hybrid graph"
     legend = {}
-    with new_figure(size[0] / DPI, size[1] / DPI, layout=None) as figure:
+    with pixel_figure(*size) as figure:
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()
         axes.set_xlim(0, size[0])

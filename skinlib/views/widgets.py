@@ -38,7 +38,9 @@ class SliderLab(ipywidgets.VBox):
         self.function = function
         self.controls = dict(controls)
         self.picture: Picture | None = None
-        self._image = ipywidgets.Image(format="jpeg", layout={"max_width": "100%"})
+        self._image = ipywidgets.Image(
+            format="jpeg", layout={"max_width": "100%", "align_self": "flex-start"}
+        )
         self._message = ipywidgets.HTML()
         grid = ipywidgets.Box(
             list(self.controls.values()), layout={"flex_flow": "row wrap"}
@@ -115,7 +117,8 @@ def slider_lab(
             what takes longer than 200 ms.
         start: first values; the low end, the first option or the bool itself without.
         ranges: by argument, `(low, high)` or `(low, high, step)` for a slider, whole
-            numbers when low, high and step are; a list for a menu; a bool for a box.
+            numbers when low, high and step are; a list of options, or of pairs
+            `(label, option)`, for a menu; a bool for a box.
 
     Raises:
         ValueError: a range that is none of these.
@@ -143,8 +146,8 @@ def _control(name: str, spread, value) -> ipywidgets.Widget:
         checked = spread if value is None else bool(value)
         return ipywidgets.Checkbox(checked, indent=True, **common)
     if isinstance(spread, list) and spread:
-        value = spread[0] if value is None else value
-        return ipywidgets.Dropdown(options=spread, value=value, **common)
+        chosen = {} if value is None else {"value": value}
+        return ipywidgets.Dropdown(options=spread, **chosen, **common)
     if isinstance(spread, tuple) and len(spread) in (2, 3):
         low, high = spread[:2]
         whole = all(isinstance(number, int) for number in spread)
@@ -173,7 +176,7 @@ def pose_picture(
     bone: str = "",
     angle: float = 0.0,
     view_from: float = 22.0,
-    colour: bool = True,
+    by_bone: bool = True,
     size: tuple[int, int] = scenes.SIZE,
     **poses: float,
 ) -> Picture:
@@ -182,13 +185,14 @@ def pose_picture(
     Args:
         bone, angle: one bone to nod by so many degrees; none when empty.
         view_from: the camera's azimuth in degrees.
+        by_bone: colour the head by bone, not like clay.
         poses: amounts of `skinlib.skinning.PRESET_POSES`, 0 rest, 1 the whole pose.
     """
     turns = {bone: angle} if bone else None
     vertices = scenes.pose_vertices(head, weights, poses, turns)
     image = scenes.render(
         head,
-        scenes.colour_by_bone(weights, head.skeleton) if colour else None,
+        scenes.colour_by_bone(weights, head.skeleton) if by_bone else None,
         vertices=vertices,
         view=scenes.View(azimuth=view_from, zoom=0.88),  # room to lean out
         size=size,
@@ -221,10 +225,10 @@ def pose_sliders(head: Head, weights: np.ndarray | None = None) -> SliderLab:
         functools.partial(pose_picture, head, weights),
         start=dict.fromkeys(ranges, 0.0) | {"view_from": 22.0, "angle": 0.0},
         **ranges,
-        bone=["", *_by_load(head, weights)],
+        bone=[("none", ""), *((name, name) for name in _by_load(head, weights))],
         angle=(-40.0, 40.0, 1.0),
         view_from=(-90.0, 90.0, 1.0),
-        colour=True,
+        by_bone=True,
     )
 
 

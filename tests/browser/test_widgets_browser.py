@@ -159,7 +159,7 @@ def test_a_slider_moved_by_keys_bends_the_head(page):
 
 def test_a_menu_shows_another_bone(page):
     old = _source(page, 1)
-    menu = page.locator("select").last
+    menu = page.locator(".widget-dropdown select").last
     menu.select_option(index=1)
     _wait_for_new_picture(page, 1, old)
     page.wait_for_timeout(1000)
