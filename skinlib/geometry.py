@@ -93,7 +93,7 @@ def weld(vertices: np.ndarray, tolerance: float = 1e-6) -> np.ndarray:
     _, first, ids = np.unique(
         grid.astype(np.int64), axis=0, return_index=True, return_inverse=True
     )
-    rank = np.empty_like(first)
+    rank = np.zeros_like(first)
     rank[np.argsort(first)] = np.arange(len(first))
     return rank[ids.reshape(-1)]
 
@@ -158,7 +158,8 @@ def curvature(
 def normal_deviation(normals: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """(V,) float64 in 0 .. 2: mean of 1 - n_a . n_b over a vertex's edges.
 
-    >>> normal_deviation(np.array([[0, 0, 1.0], [0, 1, 0]]), np.array([[0, 1]])).tolist()
+    >>> normals = np.array([[0, 0, 1.0], [0, 1, 0]])
+    >>> normal_deviation(normals, np.array([[0, 1]])).tolist()
     [1.0, 1.0]
     """
     a, b = edges.T
@@ -186,9 +187,8 @@ class Frame(NamedTuple):
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """(N, 3) points from file coordinates into the frame."""
-        return (np.asarray(points, np.float64) - self.centre) @ self.rotation.T / (
-            self.scale
-        )
+        offset = np.asarray(points, np.float64) - self.centre
+        return offset @ self.rotation.T / self.scale
 
     def rotate(self, vectors: np.ndarray) -> np.ndarray:
         """(N, 3) directions from file axes into the frame's."""
@@ -227,7 +227,8 @@ def canonical_frame(
     lateral = int(np.argmin([_mirror_misfit(joints, mass, vertices, a) for a in "xyz"]))
     has_child = np.isin(np.arange(len(joints)), parents)
     leaves = joints[~has_child].mean(axis=0)
-    rise = leaves - joints[parents < 0].mean(axis=0) + (centre - joints.mean(axis=0)) / 4
+    rise = leaves - joints[parents < 0].mean(axis=0)
+    rise += (centre - joints.mean(axis=0)) / 4
     reach = leaves - centre
     axes = [axis for axis in range(3) if axis != lateral]
     best, choice = -np.inf, None
@@ -250,7 +251,8 @@ def _mirror_misfit(joints, mass, vertices, axis) -> float:
     spread = np.ptp(joints, axis=0).max()
     if len(joints) < 3 or spread == 0:
         # Too few bones to tell: a head is narrower from ear to ear than the rest.
-        return float(np.sqrt(mass @ (vertices[:, axis] - mass @ vertices[:, axis]) ** 2))
+        offset = vertices[:, axis] - mass @ vertices[:, axis]
+        return float(np.sqrt(mass @ offset**2))
     mirrored = joints.copy()
     plane = np.median(joints[:, axis])
     mirrored[:, axis] = 2 * plane - mirrored[:, axis]

@@ -1,4 +1,4 @@
-"""The data contract: a head, its skeleton and, when an artist painted them, its weights.
+"""The data contract: a head, its skeleton and, if an artist painted them, its weights.
 
 Everything is checked once, here at the door. Code behind the door may trust a `Head`:
 arrays are finite, typed, read-only, ids are in range, parents form a forest, and each
@@ -156,7 +156,7 @@ class Skeleton:
     def reordered(self, permutation: ArrayLike) -> "Skeleton":
         """The same skeleton with bone `permutation[i]` in place i."""
         permutation = np.asarray(permutation, np.int64)
-        place = np.empty_like(permutation)
+        place = np.zeros_like(permutation)
         place[permutation] = np.arange(len(permutation))
         parents = self.parents[permutation]
         return Skeleton(
@@ -205,7 +205,7 @@ class Head:
             HeadError: naming the field, what was found and what to do.
 
         >>> bone = Skeleton.from_heads_and_tails([[0, 0, 0]], None, [-1], ["head"])
-        >>> Head.create(np.eye(3), [[0, 1, 2]], bone, weights=[[1], [1], [1]]).normals[0]
+        >>> Head.create(np.eye(3), [[0, 1, 2]], bone, weights=[[1]] * 3).normals[0]
         array([0.57735026, 0.57735026, 0.57735026], dtype=float32)
         """
         vertices = _array(vertices, np.float32, (None, 3), "vertices", file)

@@ -71,7 +71,7 @@ def supervised(
         logits: (V, J) before the softmax. target: (V, J) rows that sum to 1.
     """
     weights = weights or LossWeights()
-    predicted = logits.softmax(dim=1)
+    predicted = torch.softmax(logits, dim=1)
     total = logits.new_zeros(())
     if weights.row_l1:
         total = total + weights.row_l1 * row_l1(predicted, target)

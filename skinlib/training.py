@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from skinlib.datasets.augment import AugmentConfig, augment
@@ -45,8 +45,9 @@ class TrainConfig:
     minutes: float = 30.0  # training time, unless `steps` is given
     steps: int | None = None  # number of steps, for runs that repeat to the bit
     batch: int = 2  # heads a step
-    learning_rate: float = 1e-3  # of AdamW, after the warm-up
-    weight_decay: float = 0.01  # of AdamW
+    optimizer: str = "muon"  # muon: for matrices, with AdamW for the rest; or adamw
+    learning_rate: float = 3e-3  # after the warm-up
+    weight_decay: float = 0.01  # pull of every parameter towards 0
     warmup: int = 100  # steps over which the learning rate rises
     cooldown: float = 0.5  # last part of the run, in which the learning rate falls to 0
     clip: float = 1.0  # largest norm of a step's gradient
@@ -123,12 +124,7 @@ class Trainer:
         self.model.to(config.device)
         self.average = copy.deepcopy(self.model).requires_grad_(False)
         self.parameters = list(self.model.parameters())
-        self.optimizer = torch.optim.AdamW(
-            self.parameters,
-            lr=config.learning_rate,
-            weight_decay=config.weight_decay,
-            betas=(0.9, 0.98),
-        )
+        self.optimizers = _optimizers(self.model, config)
         # What a resumed run needs beside the tensors.
         self.steps_done, self.seconds = 0, 0.0
         self.cooldown_start: int | None = None
@@ -214,9 +210,10 @@ class Trainer:
                 f"the gradient of step {self.steps_done} is not finite: "
                 f"lower learning_rate ({self.config.learning_rate})"
             )
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.learning_rate
-        self.optimizer.step()
+        for optimizer in self.optimizers:
+            for group in optimizer.param_groups:
+                group["lr"] = self.learning_rate
+            optimizer.step()
         self.steps_done += 1
         decay = min(self.config.ema, self.steps_done / (self.steps_done + 10))
         with torch.no_grad():
@@ -243,7 +240,7 @@ class Trainer:
         return torch.autograd.grad(loss, self.parameters), error.item()
 
     def _draw(self, draw: int, rng: np.random.Generator) -> tuple[Head, HybridGraph]:
-        """The head of a draw: labelled in shuffled epochs, or unlabelled and guessed."""
+        """The head of a draw: labelled, in shuffled epochs, or unlabelled, guessed."""
         if self.unlabelled and self._progress_share() > self.config.unlabelled_start:
             if rng.random() < self.config.unlabelled_share:
                 place = int(rng.integers(len(self.unlabelled)))
@@ -324,7 +321,7 @@ class Trainer:
         tensors = {f"model.{k}": v for k, v in self.model.state_dict().items()}
         tensors |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
         for i, parameter in enumerate(self.parameters):
-            for key, value in self.optimizer.state[parameter].items():
+            for key, value in self._moments(parameter).items():
                 tensors[f"optimizer.{i}.{key}"] = value
         progress = {
             "run": self._identity(),
@@ -341,7 +338,19 @@ class Trainer:
 
     def _resume(self) -> None:
         tensors, metadata = _read(self.out / STATE)
-        progress = json.loads(metadata["progress"])
+        try:
+            self._restore(tensors, json.loads(metadata["progress"]))
+        except HeadError:
+            raise
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise HeadError(
+                "checkpoint",
+                f"a file that is no state of a run ({type(error).__name__})",
+                "copy the file again, or delete it and train anew",
+                self.out / STATE,
+            ) from error
+
+    def _restore(self, tensors: dict[str, Tensor], progress: dict) -> None:
         if progress["run"] != self._identity():
             differs = [
                 key
@@ -370,13 +379,21 @@ class Trainer:
             state = part(f"optimizer.{i}")
             if state:
                 moments = {k: v.to(parameter.device) for k, v in state.items()}
-                moments["step"] = state["step"]
-                self.optimizer.state[parameter] = moments
+                if "step" in state:
+                    moments["step"] = state["step"]
+                self._moments(parameter).update(moments)
         self.steps_done, self.seconds = progress["steps_done"], progress["seconds"]
         self.cooldown_start = progress["cooldown_start"]
         self.best, self.history = progress["best"], progress["history"]
         if progress["recent"] is not None:
             self.recent = progress["recent"]
+
+    def _moments(self, parameter: Tensor) -> dict[str, Tensor]:
+        """What the optimizer in charge of a parameter remembers of it."""
+        for optimizer in self.optimizers:
+            if any(parameter is p for g in optimizer.param_groups for p in g["params"]):
+                return optimizer.state[parameter]
+        raise AssertionError("every parameter has an optimizer")
 
     def _identity(self) -> dict:
         """What has to be the same for a run to be the same."""
@@ -428,7 +445,7 @@ def load_model(name: str | Path) -> SkinningModel:
         config = ModelConfig(**(settings | {"graph": GraphConfig(**settings["graph"])}))
         model = SkinningModel(config)
         model.load_state_dict(tensors)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (ArithmeticError, LookupError, TypeError, ValueError, RuntimeError) as error:
         raise HeadError(
             "checkpoint",
             f"a file that is no skinlib model ({type(error).__name__})",
@@ -441,6 +458,30 @@ def load_model(name: str | Path) -> SkinningModel:
 def finetune_config(config: TrainConfig, **changes) -> TrainConfig:
     """A configuration for going on from a trained model: a tenth of the step size."""
     return replace(config, learning_rate=config.learning_rate / 10, **changes)
+
+
+def _optimizers(model: SkinningModel, config: TrainConfig):
+    """AdamW for all parameters, or Muon for matrices between features and AdamW.
+
+    Muon makes the update of a matrix orthogonal, so that no direction of it starves.
+    Source: Jordan et al. 2024, Muon: an optimizer for hidden layers in neural networks.
+    """
+    if config.optimizer not in ("muon", "adamw"):
+        raise ValueError(f"optimizer is {config.optimizer!r}: use muon or adamw")
+    shared = {"lr": config.learning_rate, "weight_decay": config.weight_decay}
+    matrices = [
+        module.weight
+        for module in model.modules()
+        if isinstance(module, nn.Linear) and min(module.weight.shape) > 12
+    ]
+    if config.optimizer == "adamw" or not matrices:
+        return [torch.optim.AdamW(model.parameters(), betas=(0.9, 0.98), **shared)]
+    chosen = {id(matrix) for matrix in matrices}
+    rest = [p for p in model.parameters() if id(p) not in chosen]
+    return [
+        torch.optim.Muon(matrices, adjust_lr_fn="match_rms_adamw", **shared),
+        torch.optim.AdamW(rest, betas=(0.9, 0.98), **shared),
+    ]
 
 
 def _check_labelled(heads: Sequence[Head]) -> None:

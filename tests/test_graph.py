@@ -102,7 +102,7 @@ def sheets(gap: float, flip: bool, bridge: bool = False, side: int = 6) -> Head:
         low, high = ids[0], ids[0] + side * side
         faces += [np.stack([low[:-1], low[1:], high[1:]], 1)]
         faces += [np.stack([low[:-1], high[1:], high[:-1]], 1)]
-    points = np.concatenate([sheet, sheet + [0, 0, gap]])
+    points = np.concatenate([sheet, sheet + np.array([0, 0, gap])])
     return Head.create(points, np.concatenate(faces), BONES)
 
 
@@ -125,7 +125,9 @@ def test_joined_sheets_are_not_short_circuited(flip):
     assert graph.island.max() == 0
     assert crossings(graph, 36, MESH) > 0
     far = {
-        (a, b) for a, b in edge_set(graph, SPACE) if (a < 36) != (b < 36) and a % 36 > 11
+        (a, b)
+        for a, b in edge_set(graph, SPACE)
+        if (a < 36) != (b < 36) and a % 36 > 11
     }
     assert far == set()
     open_gates = GraphConfig(min_cosine=-1, max_detour=np.inf)
@@ -218,7 +220,7 @@ def test_sides_that_face_each_other_are_no_seam():
 def test_touching_spheres_are_no_seam():
     # They share a position, but no border.
     ball = sphere(1)
-    points = np.concatenate([ball.vertices, ball.vertices + [2, 0, 0]])
+    points = np.concatenate([ball.vertices, ball.vertices + np.array([2, 0, 0])])
     faces = np.concatenate([ball.faces, ball.faces + 42])
     graph = build_graph(Head.create(points, faces, BONES))
     assert len(graph) == 84 and len(set(graph.island.tolist())) == 2

@@ -214,9 +214,7 @@ def test_graph_attention_refuses_heads_that_do_not_divide():
 def graph_layers():
     return [
         pytest.param(EdgeConv(C, C), (), id="edgeconv"),
-        pytest.param(
-            GraphAttention(C, C, 2), (torch.rand(N, K) < 0.7,), id="gat"
-        ),
+        pytest.param(GraphAttention(C, C, 2), (torch.rand(N, K) < 0.7,), id="gat"),
     ]
 
 

@@ -95,7 +95,9 @@ def test_another_order_of_bones_permutes_the_columns(model, head):
 
 def test_another_order_of_vertices_permutes_the_rows(model, head):
     order = np.random.default_rng(1).permutation(len(head.vertices))
-    other = Head.create(head.vertices[order], np.argsort(order)[head.faces], head.skeleton)
+    other = Head.create(
+        head.vertices[order], np.argsort(order)[head.faces], head.skeleton
+    )
     expected = model.predict(head, prune=0.0)[order]
     np.testing.assert_allclose(model.predict(other, prune=0.0), expected, atol=1e-4)
 
@@ -213,7 +215,9 @@ def test_the_input_of_a_sphere_by_hand():
     mesh, bones = prepare(head)
     radius = mesh.positions.norm(dim=1)
     np.testing.assert_allclose(radius, 1, atol=0.03)
-    np.testing.assert_allclose((mesh.positions * mesh.normals).sum(1), radius, atol=0.01)
+    np.testing.assert_allclose(
+        (mesh.positions * mesh.normals).sum(1), radius, atol=0.01
+    )
     # The curvature 1 / radius of a unit sphere, over the unit of 10.
     np.testing.assert_allclose(mesh.curvature, np.tanh(0.1), atol=0.01)
     assert mesh.areas.mean() == pytest.approx(1)
@@ -264,7 +268,10 @@ def test_the_content_hash_changes_with_anything_that_is_read(head):
         head.replace(faces=flipped, normals=head.normals),
         head.replace(normals=-head.normals),
         head.replace(faces=head.faces[:-1], normals=head.normals),
-        *(head.replace(skeleton=tree, weights=None) for tree in (shifted, longer, root)),
+        *(
+            head.replace(skeleton=tree, weights=None)
+            for tree in (shifted, longer, root)
+        ),
     ]
     names = {content_hash(h, config) for h in heads}
     names.add(content_hash(head, GraphConfig(nearest=3)))

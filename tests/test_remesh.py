@@ -255,6 +255,12 @@ def test_the_smallest_meshes(remesh):
     np.testing.assert_allclose(result.weights.sum(axis=1), 1, atol=1e-6)
 
 
+def test_isotropic_reaches_the_open_border():
+    x, y = np.meshgrid(np.linspace(0, 1, 21), np.linspace(0, 1, 21), indexing="ij")
+    square = grid(x, y, np.zeros_like(x))
+    assert total_area(isotropic(square, 0, vertices=100)) > 0.98
+
+
 def test_isotropic_keeps_islands_too_small_for_their_share(bust):
     assert island_count(isotropic(bust, 0, vertices=150)) == island_count(bust)
 

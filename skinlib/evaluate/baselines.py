@@ -86,9 +86,7 @@ def bone_heat(head: Head) -> np.ndarray:
     system = sparse.diags(source + np.where(seen, 0, 1))
     if len(faces):
         system = system - igl.cotmatrix(points, faces)
-    weights = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A").solve(
-        source[:, None] * p
-    )
+    weights = _factor(system).solve(source[:, None] * p)
 
     blind = ~seen
     if blind.any():
@@ -345,9 +343,19 @@ def _inpaint(head: Head, weights: np.ndarray, known: np.ndarray) -> np.ndarray:
     energy = (-laplacian + laplacian @ sparse.diags(1 / mass) @ laplacian).tocsr()
     free = ~known
     right = -energy[free][:, known] @ values[known]
-    values[free] = splu(energy[free][:, free].tocsc()).solve(right)
+    values[free] = _factor(energy[free][:, free]).solve(right)
     nearest = weights[first].argmax(axis=1)
     return _filled(values, nearest)[node]
+
+
+def _factor(matrix):
+    """LU of a symmetric positive matrix: symmetric pivots keep it sparse."""
+    return splu(
+        matrix.tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0,
+        options={"SymmetricMode": True},
+    )
 
 
 def _visible(points, faces, heads, tails) -> np.ndarray:

@@ -11,16 +11,17 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from skinlib.geometry import canonical_frame, curvature, normal_deviation
+from skinlib.geometry import Frame, canonical_frame, curvature, normal_deviation
 from skinlib.graph import GraphConfig, build_graph, node_areas, node_normals
 from skinlib.head import Head
 
 # Curvature is 1 / radius; a lid or a lip bends about 10 times as much as the skull.
 CURVATURE_UNIT = 10.0
-# Nothing that belongs to a head is further from it, in head radii; what is (a vertex left
+# In head radii: nothing that belongs to a head is further away. What is (a vertex left
 # behind, a bone in another unit) would overflow once squared.
 FAR = 1e3
-CACHE_VERSION = "1"
+CACHE_VERSION = "2"
+MIN_FRAME_BONES = 5
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class _Tensors:
 class MeshInput(_Tensors):
     """What the mesh encoder reads: N nodes with K neighbours, over V vertices.
 
-    Positions are in the head's frame (`canonical_frame`), so they have no unit.
+    Positions are in the head's frame (`bone_frame`), so they have no unit.
     """
 
     positions: Tensor  # (N, 3)
@@ -113,14 +114,29 @@ def _prepare(head, config):
     return mesh_input(head, graph), skeleton_input(head)
 
 
-def _frame(head):
+def bone_frame(head: Head) -> Frame:
+    """The frame the network sees: axes of `canonical_frame`, sized by the bones.
+
+    Hair, hats and collars move the middle of the surface, not the face bones. So the
+    origin is the median joint and the scale twice the median distance from it. Fewer
+    than five bones say too little; the surface decides then.
+    """
     skeleton = head.skeleton
-    return canonical_frame(head.vertices, head.faces, skeleton.joints, skeleton.parents)
+    joints = skeleton.joints.astype(np.float64)
+    frame = canonical_frame(head.vertices, head.faces, joints, skeleton.parents)
+    if len(joints) < MIN_FRAME_BONES:
+        return frame
+    centre = np.median(joints, axis=0)
+    scale = 2 * float(np.median(np.linalg.norm(joints - centre, axis=1)))
+    # Bones all but in one place, or far from the mesh, say nothing about its size.
+    if not frame.scale / 10 < scale < frame.scale * 10:
+        return frame
+    return Frame(frame.rotation, centre, scale)
 
 
 def mesh_input(head: Head, graph) -> MeshInput:
     """The mesh half; `graph` may come from an earlier pose of the same mesh."""
-    frame = _frame(head)
+    frame = bone_frame(head)
     positions = frame.apply(head.vertices[graph.vertex_of_node])
     normals = node_normals(head.normals, graph.node_of_vertex, len(graph))
     normals = frame.rotate(normals)
@@ -143,7 +159,7 @@ def mesh_input(head: Head, graph) -> MeshInput:
 
 def skeleton_input(head: Head) -> SkeletonInput:
     """The skeleton half."""
-    frame, skeleton = _frame(head), head.skeleton
+    frame, skeleton = bone_frame(head), head.skeleton
     return SkeletonInput(
         _float(np.clip(frame.apply(skeleton.joints), -FAR, FAR)),
         _float(frame.rotate(skeleton.directions)),

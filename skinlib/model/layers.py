@@ -18,7 +18,7 @@ class _GatherMax(torch.autograd.Function):
         winner = torch.zeros_like(best, dtype=torch.uint8)
         for k in range(1, len(columns)):
             candidate = values.index_select(0, columns[k])
-            # k grows, so the last neighbour that beat the best so far has the largest k.
+            # k grows, so the last neighbour to beat the best so far has the largest k.
             beats = (candidate > best).view(torch.uint8).mul_(k)
             winner = torch.maximum(winner, beats)
             best = torch.maximum(best, candidate)
