@@ -139,7 +139,7 @@ def curvature(
 
     Along an edge the normal curvature is k = (n_b - n_a) . (b - a) / |b - a|^2; a
     vertex takes the mean over its edges. It asks for nothing but an edge list, so it
-    also works on open, non-manifold and welded meshes.
+    also works on open, non-manifold and welded meshes. Equation `curvature`.
 
     >>> circle = np.array([[np.cos(t), np.sin(t), 0] for t in (0.0, 0.1)]) * 2
     >>> curvature(circle, circle / 2, np.array([[0, 1]])).round(3).tolist()
@@ -157,6 +157,8 @@ def curvature(
 
 def normal_deviation(normals: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """(V,) float64 in 0 .. 2: mean of 1 - n_a . n_b over a vertex's edges.
+
+    Equation `normal_deviation`.
 
     >>> normals = np.array([[0, 0, 1.0], [0, 1, 0]])
     >>> normal_deviation(normals, np.array([[0, 1]])).tolist()

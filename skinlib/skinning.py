@@ -29,7 +29,7 @@ VERTEX_TOLERANCE = 0.01
 
 
 def linear_blend_skinning(vertices: Array, weights: Array, transforms: Array) -> Array:
-    """Posed vertices: x_v = sum_j w_vj (T_j [p_v; 1]).
+    """Posed vertices: x_v = sum_j w_vj (T_j [p_v; 1]). Equation `lbs`.
 
     Args:
         vertices: (V, 3) rest positions. weights: (V, J), rows with sum 1.
@@ -58,7 +58,7 @@ def forward_kinematics(
     """Transforms of all bones when each turns about its own joint.
 
     T_j = T_parent(j) [R_j | p_j + t_j - R_j p_j], so posed = T_j rest, and children
-    follow their parents. Axes are those of the file, at every bone.
+    follow their parents. Axes are those of the file, at every bone. Equation `fk`.
 
     Args:
         rotations: (..., J, 3, 3); or (..., J, 4, 4) rigid motions in axes centred at

@@ -211,7 +211,7 @@ def test_evaluate_writes_the_table_and_the_numbers(run, capsys):
     [
         ("skin no.glb out.glb", "no.glb: file"),
         ("skin bare.npz out.fbx", "out.fbx"),
-        ("skin bare.npz out.npz --checkpoint ./nowhere", "nowhere"),
+        ("skin bare.npz out.npz --checkpoint no/where", "no/where"),
         ("skin bare.npz out.npz --max-influences 0", "--max-influences"),
         ("skin bare.npz out.npz --lock mouth_of_truth", "mouth_of_truth"),
         ("skin bare.npz out.npz --lock head", "no weights that could be kept"),

@@ -124,12 +124,9 @@ def test_joined_sheets_are_not_short_circuited(flip):
     check(graph, 72)
     assert graph.island.max() == 0
     assert crossings(graph, 36, MESH) > 0
-    far = {
-        (a, b)
-        for a, b in edge_set(graph, SPACE)
-        if (a < 36) != (b < 36) and a % 36 > 11
-    }
-    assert far == set()
+    # Next to the bridge the way around is short; two rows on it is not.
+    far = [pair for pair in edge_set(graph, SPACE) if pair[0] % 36 >= 12]
+    assert all((a < 36) == (b < 36) for a, b in far)
     open_gates = GraphConfig(min_cosine=-1, max_detour=np.inf)
     assert crossings(build_graph(head, open_gates), 36, SPACE) > 20
 

@@ -204,7 +204,7 @@ def test_unused_neighbours_do_not_matter(table):
 
 
 def test_graph_attention_refuses_heads_that_do_not_divide():
-    with pytest.raises(ValueError, match="outputs = 6 .* heads = 4"):
+    with pytest.raises(ValueError, match=r"outputs = 6 .* heads = 4"):
         GraphAttention(3, 6, heads=4)
 
 
@@ -344,8 +344,9 @@ def test_bone_features_by_hand():
     )
     assert skeleton.tails.tolist() == [[0, 3, 0], [0, 3, 0]]
     root, leaf = bone_features(skeleton).tolist()
-    assert root == [0, 1, 0] + [0, 1, 0] + [2] + [0, 0, 0] + [1, 0]
-    assert leaf == [0, 3, 0] + [0, 0, 0] + [0] + [0, 2, 0] + [0, 1]
+    # Joint, direction, length, offset from the parent, root, leaf.
+    assert root == [0, 1, 0, 0, 1, 0, 2, 0, 0, 0, 1, 0]
+    assert leaf == [0, 3, 0, 0, 0, 0, 0, 0, 2, 0, 0, 1]
 
 
 def test_tree_conv_by_hand():

@@ -33,6 +33,7 @@ ROOMS = (
     "garments",
     "pose_transfer",
     "views",
+    "exercises",
     "check",
     "demo",
     "cli",

@@ -1,4 +1,4 @@
-"""Training on tiny heads: it learns, stops anywhere, goes on, and repeats to the bit."""
+"""Training on tiny heads: it learns, stops anywhere, goes on, repeats to the bit."""
 
 import json
 import os
@@ -336,7 +336,7 @@ def test_going_on_from_a_trained_model(heads, finished, tmp_path):
 
 @pytest.mark.parametrize("name", ["there_is_none", "a/b", "a.safetensors"])
 def test_a_checkpoint_that_is_not_there(name):
-    with pytest.raises(HeadError, match="missing|no such file"):
+    with pytest.raises(HeadError, match=r"missing|no such file"):
         load_model(name)
 
 
@@ -388,9 +388,7 @@ def test_a_damaged_state_is_one_error(heads, finished, tmp_path, how):
     byte=st.integers(0, 255),
     header=st.booleans(),
 )
-def test_a_flipped_byte_is_one_error_or_a_model(
-    finished, tmp_path, place, byte, header
-):
+def test_another_byte_is_one_error_or_a_model(finished, tmp_path, place, byte, header):
     content = bytearray((finished / WEIGHTS).read_bytes())
     span = 3000 if header else len(content)
     content[int(place * span)] = byte

@@ -13,8 +13,9 @@ from scipy.sparse.csgraph import connected_components
 from skinlib.geometry import mesh_edges, weld
 from skinlib.head import Head
 
-# Edits of one mesh share more than this part of the smaller one's neighbourhoods. Among
-# game characters, unrelated heads reach 0.45, as eyes, teeth and tongue are reused.
+# There is no gap between edits of one mesh and other heads: similarity falls off
+# gradually. On 82 game characters 0.5 gives the number of heads, 38, that are known to
+# share a base mesh; a lower value makes larger groups and a stricter split.
 SHARED = 0.5
 ROUNDS = 3
 

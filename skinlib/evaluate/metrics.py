@@ -85,6 +85,8 @@ def score(
 def row_l1(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
     """(V,) sum over bones of |w^ - w|: 0 is perfect, 2 is all wrong (RigNet's "L1").
 
+    Equation `row_l1`.
+
     >>> row_l1(np.array([[0.5, 0.5], [1, 0]]), np.array([[1, 0], [0, 1.0]])).tolist()
     [1.0, 2.0]
     """
@@ -118,7 +120,7 @@ def precision_recall(
     """Of the influences predicted, the part that is real; of the real, the part found.
 
     An influence is a weight above `threshold`; counted over all vertices and bones of
-    a head. Each is 1 when there is nothing to count.
+    a head. Each is 1 when there is nothing to count. Equation `precision_recall`.
 
     >>> precision_recall(np.array([[0.6, 0.2, 0.2]]), np.array([[0.5, 0.5, 0.0]]))
     (0.6666666666666666, 1.0)
@@ -170,7 +172,7 @@ def dominant_bone_accuracy(predicted: np.ndarray, target: np.ndarray) -> float:
 def per_bone_iou(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
     """(J,) sum_v min(w^, w) / sum_v max(w^, w), the weighted form of IoU, in 0 .. 1.
 
-    NaN for a bone that has no weight on either side.
+    NaN for a bone that has no weight on either side. Equation `bone_iou`.
 
     >>> per_bone_iou(np.array([[1, 0, 0.0]]), np.array([[0.5, 0.5, 0]])).tolist()
     [0.5, 0.0, nan]
@@ -221,7 +223,7 @@ def deformation_errors(
     `deformation_mean` and `deformation_max` are over `RANDOM_POSES` random poses, each
     bone turned by 15 to 25 degrees relative to its parent; the same under
     `jaw_open_mean`, `blink_max`, ... for each preset pose that the rig has bones for.
-    The maximum is over vertices and poses.
+    The maximum is over vertices and poses. Equation `deformation_error`.
     """
     skeleton = head.skeleton
     poses = {"deformation": random_poses(skeleton, RANDOM_POSES, seed)}
@@ -286,7 +288,7 @@ def seam_bleed(
     The seam is where the artist's m jumps through the air: vertices with more than half
     of the head's largest m that have one with less than a tenth of it, or the other way
     round, closer than 5 % of the head's height but more than twice as far along the
-    surface. NaN when there is no such place.
+    surface. NaN when there is no such place. Equation `seam_bleed`.
 
     Args:
         bones: (J,) bool, the bones of one side.
@@ -328,6 +330,7 @@ def symmetry_error(weights: np.ndarray, head: Head) -> float:
 
     Over the vertices that have a mirror image (`mirror_vertices`); NaN when none has.
     Artists' own weights are not perfectly symmetric either: compare with theirs.
+    Equation `symmetry_error`.
     """
     partner = mirror_vertices(head)
     found = partner >= 0
