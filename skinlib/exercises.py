@@ -13,6 +13,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
+from scipy.spatial import cKDTree
 
 Check = Callable[[Any], str | None]
 CHECKS: dict[str, Check] = {}
@@ -92,25 +94,120 @@ def same(found: Any, wanted: Any, tolerance: float = 1e-5) -> bool:
     return bool(np.allclose(found, wanted, rtol=tolerance, atol=tolerance))
 
 
+# ---- 02 hybrid graph
+
+
+@exercise("02.1")
+def _nearest(nearest: Callable) -> str | None:
+    """`nearest(points, k)`: (N, k) ids of the k nearest others, nearest first."""
+    line = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [7, 0, 0], [8, 0, 0]])
+    found = np.asarray(nearest(line.copy(), 2))
+    if found.shape != (5, 2):
+        return f"5 points and k = 2 went in, shape {found.shape} came out"
+    if (found == np.arange(5)[:, None]).any():
+        return "no point is its own neighbour: make the diagonal infinite"
+    if not same(np.sort(found, axis=1), [[1, 2], [0, 2], [0, 1], [2, 4], [2, 3]]):
+        return "for the points 0, 1, 3, 7, 8 on a line the ids are not the nearest"
+    if not same(found, [[1, 2], [0, 2], [1, 0], [4, 2], [3, 2]]):
+        return "the nearest comes first"
+    twins = np.array([[0.0, 0, 0], [0, 0, 0], [5, 0, 0]])
+    if not same(nearest(twins, 1)[:2], [[1], [0]]):
+        return "two points may lie at one place: each is then the other's nearest"
+    points = np.random.default_rng(0).normal(size=(40, 3))
+    _, wanted = cKDTree(points).query(points, k=6)
+    if not same(nearest(points.copy(), 5), wanted[:, 1:]):
+        return "in space it differs from cKDTree: use all three coordinates"
+    return None
+
+
+@exercise("02.2")
+def _hops_on_table(hops: Callable) -> str | None:
+    """`hops(neighbours, start)`: (N,) steps along the table; -1 out of reach."""
+    # A way 0 - 1 - 2 - 3, and the pair 4 - 5 that it never meets.
+    table = np.array([[1, 1], [0, 2], [1, 3], [2, 2], [5, 5], [4, 4]])
+    steps = np.asarray(hops(table.copy(), 0))
+    if steps.shape != (6,):
+        return f"6 nodes went in, shape {steps.shape} came out"
+    if steps[0] != 0:
+        return "from the start to itself it is 0"
+    if not same(steps[4:], [-1, -1]):
+        return "what no edge leads to is -1"
+    if not same(steps, [0, 1, 2, 3, -1, -1]):
+        return "on the way 0 - 1 - 2 - 3 the steps from 0 are 0, 1, 2, 3"
+    if not same(hops(table.copy(), 2), [2, 1, 0, 1, -1, -1]):
+        return "the start may be any node"
+    ring = (np.arange(9)[:, None] + [1, -1]) % 9
+    if not same(hops(ring, 0), [0, 1, 2, 3, 4, 4, 3, 2, 1]):
+        return "around a ring there are two ways: the shorter one counts"
+    return None
+
+
+# ---- 03 mesh encoder
+
+
+@exercise("03.1")
+def _mean_conv(mean_conv: Callable) -> str | None:
+    """`mean_conv(x, neighbours, used)`: the mean over the used neighbours; else 0."""
+    x = torch.tensor([[1.0, 0.0], [2.0, 4.0], [6.0, 8.0], [9.0, 9.0]])
+    table = torch.tensor([[1, 2], [0, 0], [1, 0], [3, 3]])
+    used = torch.tensor([[True, True], [True, False], [True, True], [False, False]])
+    out = mean_conv(x.clone(), table, used)
+    if tuple(out.shape) != (4, 2):
+        return f"x of shape (4, 2) went in, shape {tuple(out.shape)} came out"
+    if not same(out[[0, 2]], [[4, 6], [1.5, 2]]):
+        return "node 0 hears nodes 1 and 2: their mean is (4, 6)"
+    if not same(out[3], [0, 0]):
+        return "a node without neighbours gets 0, not NaN and not its own value"
+    far = torch.tensor([[1, 2], [0, 3], [1, 0], [3, 3]])
+    if not same(mean_conv(x.clone(), far, used), out):
+        return "what stands in an unused place must not matter"
+    if not same(out, [[4, 6], [1, 0], [1.5, 2], [0, 0]]):
+        return "divide by the number of used neighbours, not by K"
+    return None
+
+
+@exercise("03.2")
+def _read(read: Callable) -> str | None:
+    """`read(points, x, areas)`: softmax of points . x + log area, times x."""
+    x = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+    ones = torch.ones(2)
+    points = torch.tensor([[0.0, 0.0], [float(np.log(3)), 0.0], [100.0, 0.0]])
+    out = read(points.clone(), x.clone(), ones)
+    if tuple(out.shape) != (3, 2):
+        return f"3 points read 2 channels, but shape {tuple(out.shape)} came out"
+    if not same(out[0], [0.5, 0.5]):
+        return "a point of zeros takes the plain mean of equal areas"
+    if not same(out, [[0.5, 0.5], [0.75, 0.25], [1, 0]]):
+        return "with scores log 3 and 0 the shares are 3/4 and 1/4"
+    shares = read(points[:1], x.clone(), torch.tensor([3.0, 1.0]))
+    if not same(shares, [[0.75, 0.25]]):
+        return "a node with three times the area counts three times: add log area"
+    cut = read(points.clone(), x[[0, 1, 1]], torch.tensor([1.0, 0.5, 0.5]))
+    if not same(cut, out):
+        return "cutting a node into two halves must change nothing"
+    return None
+
+
 # ---- 04 skeleton encoder
 
 
 @exercise("04.1")
-def _hops(hops: Callable) -> str | None:
-    """`hops(parents, a, b)`: edges on the way from bone a to bone b; -1 for none."""
-    parents = np.array([-1, 0, 1, 0, -1])
+def _moved_bones(moved: Callable) -> str | None:
+    """`moved(parents)`: how many bones move when each one turns, itself included."""
     cases = [
-        (2, 2, 0, "from a bone to itself it is 0"),
-        (1, 0, 1, "a bone and its parent are 1 apart"),
-        (0, 2, 2, "the way down is as long as the way up"),
-        (2, 3, 3, "go up from both bones, and meet at an ancestor they share"),
-        (2, 4, -1, "two trees share no ancestor: the answer is -1"),
+        ([-1], [1], "a single bone moves itself: 1"),
+        ([-1, 0, 0], [3, 1, 1], "a root with two children moves three bones"),
+        (
+            [-1, 0, 1],
+            [3, 2, 1],
+            "grandchildren move too: count children before parents",
+        ),
+        ([1, 2, -1], [1, 2, 3], "a parent may have a larger id than its child"),
+        ([-1, -1, 1], [1, 2, 1], "two trees do not move each other"),
     ]
-    for a, b, wanted, hint in cases:
-        if not same(hops(parents, a, b), wanted):
+    for parents, wanted, hint in cases:
+        if not same(moved(np.array(parents)), wanted):
             return hint
-    if not same(hops(np.array([1, 2, -1]), 0, 2), 2):
-        return "a parent may have a larger id than its child"
     return None
 
 

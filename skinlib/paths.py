@@ -4,7 +4,7 @@ from pathlib import Path
 
 from skinlib.head import HeadError
 
-DEFAULT_CHECKPOINT = "default"
+DEFAULT_CHECKPOINT = "heads"
 
 
 def repository_file(*parts: str) -> Path:

@@ -45,6 +45,7 @@ class TrainConfig:
     minutes: float = 30.0  # training time, unless `steps` is given
     steps: int | None = None  # number of steps, for runs that repeat to the bit
     batch: int = 2  # heads a step
+    judged_nodes: int = 1024  # nodes of a head whose weights enter the loss
     optimizer: str = "muon"  # muon: for matrices, with AdamW for the rest; or adamw
     learning_rate: float = 3e-3  # after the warm-up
     weight_decay: float = 0.01  # pull of every parameter towards 0
@@ -232,9 +233,12 @@ class Trainer:
         if not self.config.augment.keeps_mesh:
             graph = build_graph(head, self.model.config.graph)
         mesh, skeleton = mesh_input(head, graph), skeleton_input(head)
-        target = torch.from_numpy(head.weights[graph.vertex_of_node])
+        judged = min(len(graph), self.config.judged_nodes)
+        nodes = torch.from_numpy(rng.choice(len(graph), judged, replace=False))
+        target = torch.from_numpy(head.weights[graph.vertex_of_node])[nodes]
         device = self.config.device
-        logits = self.model.node_logits(mesh.to(device), skeleton.to(device))
+        mesh, skeleton = mesh.to(device), skeleton.to(device)
+        logits = self.model.node_logits(mesh, skeleton, nodes.to(device))
         loss = supervised(logits, target.to(device), self.config.loss)
         error = (logits.detach().softmax(1).cpu() - target).abs().sum(1).mean()
         return torch.autograd.grad(loss, self.parameters), error.item()

@@ -15,17 +15,13 @@ def said(capsys, name, answer) -> str:
     return verdict
 
 
-def hops(parents, a, b):
-    way = {a: 0}
-    while parents[a] >= 0:
-        way[parents[a]] = way[a] + 1
-        a = parents[a]
-    steps = 0
-    while b not in way:
-        if parents[b] < 0:
-            return -1
-        b, steps = parents[b], steps + 1
-    return way[b] + steps
+def moved(parents):
+    count = np.ones(len(parents), int)
+    for bone in range(len(parents)):
+        while parents[bone] >= 0:
+            bone = parents[bone]
+            count[bone] += 1
+    return count
 
 
 def softmax(logits):
@@ -34,14 +30,19 @@ def softmax(logits):
 
 
 SOLUTIONS = {
-    "04.1": hops,
+    "04.1": moved,
     "04.2": [7, 0, 3],
     "05.1": softmax,
     "05.2": lambda logits, allowed: softmax(np.where(allowed, logits, -np.inf)),
 }
 WRONG = [
-    ("04.1", lambda parents, a, b: 1, "itself it is 0"),
-    ("04.1", lambda parents, a, b: abs(hops(parents, a, b)), "share no ancestor"),
+    ("04.1", lambda parents: 1, "single bone"),
+    ("04.1", lambda parents: np.ones(len(parents)), "moves three"),
+    (
+        "04.1",
+        lambda parents: [1 + sum(parents == b) for b in range(len(parents))],
+        "grandchildren",
+    ),
     ("04.2", [0, 3, 6, 7], "as long as"),
     ("04.2", [0], "three of the blocks"),
     ("04.2", [0, 3, 7, 10], "two flags"),

@@ -226,11 +226,15 @@ def test_touching_spheres_are_no_seam():
 # ---------------------------------------------------------------- odd meshes
 
 
-def test_islands_get_no_edges_between_them_however_near():
+@pytest.mark.parametrize("gates", ["shut", "open"])
+def test_islands_get_no_edges_between_them_however_near(gates):
+    config = GraphConfig()
+    if gates == "open":
+        config = GraphConfig(min_cosine=-1, max_detour=np.inf)
     ball = sphere(1)
     points = np.concatenate([ball.vertices, ball.vertices * 1.001])
     faces = np.concatenate([ball.faces, ball.faces + 42])
-    graph = build_graph(Head.create(points, faces, BONES))
+    graph = build_graph(Head.create(points, faces, BONES), config)
     check(graph, 84)
     assert len(graph) == 84 and set(graph.island.tolist()) == {0, 1}
 

@@ -12,7 +12,7 @@ from skinlib.datasets.synthetic import synthetic_head
 from skinlib.graph import GraphConfig, build_graph
 from skinlib.model import ModelConfig, SkinningModel, prepare
 from skinlib.model.cross_attention import CrossAttention, pair_features
-from skinlib.model.inputs import MeshInput, SkeletonInput, content_hash
+from skinlib.model.inputs import MeshInput, SkeletonInput, bone_frame, content_hash
 from skinlib.model.mesh_encoder import MeshEncoder, mesh_features
 
 SMALL = {"mesh_width": 16, "bone_width": 8, "blocks": 2, "points": 4, "pair_width": 8}
@@ -211,7 +211,7 @@ def test_degenerate_heads_have_finite_gradients(name):
 
 
 def test_the_input_of_a_sphere_by_hand():
-    head = moved(sphere(2), scale=5.0, shift=(10, 0, 0))
+    head = moved(sphere(2, bones=4), scale=5.0, shift=(10, 0, 0))
     mesh, bones = prepare(head)
     radius = mesh.positions.norm(dim=1)
     np.testing.assert_allclose(radius, 1, atol=0.03)
@@ -226,6 +226,19 @@ def test_the_input_of_a_sphere_by_hand():
     expected = np.linalg.norm(head.skeleton.joints - [10, 0, 0], axis=1) / 5
     np.testing.assert_allclose(bones.joints.norm(dim=1), expected, rtol=0.05)
     assert (bones.depths == torch.from_numpy(head.skeleton.depths)).all()
+
+
+def test_the_frame_is_sized_by_the_bones_when_they_can_tell():
+    # Median joint (0, 0, 1); distances from it 2, 1, 0, 1, 2.
+    spots = [[0, 0, -1], [0, 0, 0], [0, 0, 1], [0, 1, 1], [2, 0, 1]]
+    for size, by_bones in ((1.0, True), (2.0, True), (50.0, False), (0.02, False)):
+        ball = moved(sphere(2, bones=1), scale=size, shift=(0, 0, 0.1 * size))
+        frame = bone_frame(ball.replace(skeleton=bones_at(spots)))
+        centre, scale = ([0, 0, 1], 2) if by_bones else ([0, 0, 0.1 * size], size)
+        np.testing.assert_allclose(frame.centre, centre, atol=1e-6)
+        assert frame.scale == pytest.approx(scale, rel=1e-3)
+    few = sphere(2).replace(skeleton=bones_at(spots[:4]))
+    np.testing.assert_allclose(bone_frame(few).centre, 0, atol=1e-6)
 
 
 def equal(one, other) -> bool:

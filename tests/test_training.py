@@ -34,8 +34,8 @@ from skinlib.training import (
 )
 
 TINY = ModelConfig(
-    mesh_width=8,
-    bone_width=8,
+    mesh_width=16,  # wide enough for Muon to take some of the matrices
+    bone_width=16,
     blocks=1,
     points=2,
     tree_layers=1,
@@ -141,6 +141,65 @@ def test_an_augmentation_that_changes_the_mesh(heads, tmp_path):
     assert np.isfinite(model.predict(heads[0])).all()
 
 
+def test_the_average_follows_slowly(heads, tmp_path):
+    config = replace(CONFIG_OF_TESTS, ema=0.05)
+    trainer = Trainer(config, heads[:1], tmp_path, validation=[])
+    names = [name for name, _ in trainer.model.named_parameters()]
+    slow = {name: p.clone() for name, p in trainer.average.named_parameters()}
+    for _ in range(3):
+        trainer.step()
+        # Early on the decay is less than `ema`: steps / (steps + 10).
+        decay = min(0.05, trainer.steps_done / (trainer.steps_done + 10))
+        for name in names:
+            fast = trainer.model.get_parameter(name)
+            slow[name] = decay * slow[name] + (1 - decay) * fast
+            average = trainer.average.get_parameter(name)
+            torch.testing.assert_close(average, slow[name].detach())
+    assert not torch.equal(trainer.parameters[0], next(trainer.average.parameters()))
+
+
+def test_every_draw_disturbs_a_head_in_its_own_way(heads, tmp_path):
+    trainer = Trainer(CONFIG_OF_TESTS, heads[:1], tmp_path, validation=[])
+    first, again, second = (trainer._gradient(draw)[0][0] for draw in (0, 0, 1))
+    assert torch.equal(first, again) and not torch.equal(first, second)
+
+
+def test_every_head_is_drawn_once_an_epoch(heads, tmp_path):
+    trainer = Trainer(CONFIG_OF_TESTS, heads, tmp_path, validation=[])
+    rng = np.random.default_rng(0)
+    for epoch in range(4):
+        draws = range(3 * epoch, 3 * epoch + 3)
+        names = {trainer._draw(draw, rng)[0].name for draw in draws}
+        assert names == {head.name for head in heads}
+
+
+def test_the_time_spent_is_kept(heads, tmp_path):
+    trainer = Trainer(CONFIG_OF_TESTS, heads[:1], tmp_path, validation=[])
+    trainer.seconds = 12.5
+    trainer.save()
+    resumed = Trainer(CONFIG_OF_TESTS, heads[:1], tmp_path, validation=[])
+    assert resumed.seconds == 12.5
+
+
+def test_muon_takes_the_matrices_and_adamw_the_rest(heads, tmp_path):
+    trainer = Trainer(CONFIG_OF_TESTS, heads[:1], tmp_path, validation=[])
+    muon, adamw = trainer.optimizers
+    matrices, rest = (
+        [p for group in o.param_groups for p in group["params"]] for o in (muon, adamw)
+    )
+    assert isinstance(muon, torch.optim.Muon) and matrices and rest
+    assert all(p.ndim == 2 for p in matrices)
+    every = {id(p) for p in matrices} | {id(p) for p in rest}
+    assert every == {id(p) for p in trainer.model.parameters()}
+    assert len(matrices) + len(rest) == len(every)
+
+
+def test_an_unknown_optimizer_is_refused(heads, tmp_path):
+    config = replace(CONFIG_OF_TESTS, optimizer="sgd")
+    with pytest.raises(ValueError, match="muon or adamw"):
+        Trainer(config, heads[:1], tmp_path, validation=[])
+
+
 def test_graph_attention_trains_too(heads, tmp_path):
     config = replace(
         CONFIG_OF_TESTS, steps=2, model=replace(TINY, convolution="gat", pair_width=0)
@@ -170,13 +229,15 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(
 def test_a_run_with_unlabelled_heads_resumes_to_the_same_bits(
     heads, tmp_path, monkeypatch
 ):
-    config = replace(CONFIG_OF_TESTS, unlabelled_share=0.5, unlabelled_start=0.2)
-    given = {"unlabelled": heads[1:2], "validation": heads[2:]}
-    train(config, heads[:1], tmp_path / "whole", **given)
+    config = replace(
+        CONFIG_OF_TESTS, unlabelled_share=0.5, unlabelled_start=0.2, optimizer="adamw"
+    )
+    others = {"unlabelled": heads[1:2], "validation": heads[2:]}
+    train(config, heads[:1], tmp_path / "whole", **others)
     interrupt_at(monkeypatch, 5)
     with pytest.raises(KeyboardInterrupt):
-        train(config, heads[:1], tmp_path / "cut", **given)
-    train(config, heads[:1], tmp_path / "cut", **given)
+        train(config, heads[:1], tmp_path / "cut", **others)
+    train(config, heads[:1], tmp_path / "cut", **others)
     assert same_tensors(tmp_path / "whole" / STATE, tmp_path / "cut" / STATE)
 
 
@@ -235,7 +296,7 @@ def test_minutes_end_about_in_time(heads, tmp_path):
     [
         ({"learning_rate": 0.5}, "learning_rate"),
         ({"seed": 3}, "seed"),
-        ({"model": replace(TINY, mesh_width=16)}, "model"),
+        ({"model": replace(TINY, mesh_width=8)}, "model"),
         ({"loss": LossWeights(seed=1.0), "batch": 1}, "batch, loss"),
     ],
 )
