@@ -167,24 +167,28 @@ def _mean_conv(mean_conv: Callable) -> str | None:
 
 
 @exercise("03.2")
-def _read(read: Callable) -> str | None:
-    """`read(points, x, areas)`: softmax of points . x + log area, times x."""
-    x = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
-    ones = torch.ones(2)
-    points = torch.tensor([[0.0, 0.0], [float(np.log(3)), 0.0], [100.0, 0.0]])
-    out = read(points.clone(), x.clone(), ones)
-    if tuple(out.shape) != (3, 2):
-        return f"3 points read 2 channels, but shape {tuple(out.shape)} came out"
-    if not same(out[0], [0.5, 0.5]):
-        return "a point of zeros takes the plain mean of equal areas"
-    if not same(out, [[0.5, 0.5], [0.75, 0.25], [1, 0]]):
-        return "with scores log 3 and 0 the shares are 3/4 and 1/4"
-    shares = read(points[:1], x.clone(), torch.tensor([3.0, 1.0]))
-    if not same(shares, [[0.75, 0.25]]):
-        return "a node with three times the area counts three times: add log area"
-    cut = read(points.clone(), x[[0, 1, 1]], torch.tensor([1.0, 0.5, 0.5]))
-    if not same(cut, out):
-        return "cutting a node into two halves must change nothing"
+def _max_gradient(max_gradient: Callable) -> str | None:
+    """`max_gradient(values, neighbours, upstream)`: what `gather_max` sends back."""
+    values = torch.tensor([[1.0], [2.0], [5.0], [0.0]])
+    table = torch.tensor([[1, 2, 1], [0, 2, 0], [0, 1, 3], [2, 2, 2]])
+    out = max_gradient(values.clone(), table, torch.ones(4, 1))
+    if tuple(out.shape) != (4, 1):
+        return f"values of shape (4, 1) went in, shape {tuple(out.shape)} came out"
+    if same(out[2], [1]):
+        return "a node may win in several rows: add what it receives from each"
+    if not same(out[[0, 3]], [[0], [0]]):
+        return "who never wins receives nothing"
+    if not same(out, [[0], [1], [3], [0]]):
+        return "of four ones, vertex 2 receives three and vertex 1 receives one"
+    rng = np.random.default_rng(0)
+    values = torch.from_numpy(rng.permutation(60).astype(float).reshape(20, 3))
+    table = torch.from_numpy(rng.integers(0, 20, (20, 4)))
+    upstream = torch.from_numpy(rng.normal(size=(20, 3)))
+    leaf = values.clone().requires_grad_()
+    (wanted,) = torch.autograd.grad(leaf[table].amax(dim=1), leaf, upstream)
+    # A node that stands in a row twice shares with itself there: the sum is the same.
+    if not same(max_gradient(values, table, upstream), wanted):
+        return "each channel has its own winner, and its own gradient"
     return None
 
 
@@ -212,15 +216,20 @@ def _moved_bones(moved: Callable) -> str | None:
 
 
 @exercise("04.2")
-def _mirrored_columns(columns: Any) -> str | None:
-    """Which of the 12 bone features change sign when x does."""
-    columns = sorted(int(column) for column in columns)
-    if columns == [0, 3, 7]:
+def _mirrored_features(mirrored: Callable) -> str | None:
+    """`mirrored(features)`: (J, 12) bone features of the skeleton's mirror image."""
+    features = torch.arange(1.0, 25.0).reshape(2, 12)
+    found = mirrored(features.clone())
+    if tuple(found.shape) != (2, 12):
+        return f"features of shape (2, 12) went in, shape {tuple(found.shape)} came out"
+    sign = np.ones(12)
+    sign[[0, 3, 7]] = -1
+    if same(found, features * torch.tensor(sign)):
         return None
-    if 6 in columns:
-        return "a mirror image is as long as the bone"
-    if not {0, 3, 7} <= set(columns):
-        return "three of the blocks are vectors, and each has an x"
+    if not same(found[:, 6], features[:, 6]):
+        return "column 6 is the length: a mirror image is as long as the bone"
+    if not same(found[:, [0, 3, 7]], -features[:, [0, 3, 7]]):
+        return "joint, direction and offset are vectors, and each has an x"
     return "y, z and the two flags are the same in a mirror"
 
 

@@ -163,15 +163,18 @@ def _mesh_table(positions, edges, width):
 
 
 def _gated_nearest(positions, normals, island, mesh, length, config, chunk=4096):
-    """(N, nearest) nodes that pass the gates, nearest first, -1 elsewhere."""
+    """(N, nearest + 2) nodes that pass the gates, nearest first, -1 elsewhere."""
     count = len(positions)
-    width = min(config.nearest + 1, count)
+    width = min(config.nearest + 2, count)
     if width < 2:
         return np.full((count, 0), -1)
     straight, candidate = cKDTree(positions).query(positions, k=width)
     own = np.arange(count)[:, None]
+    # Of neighbours equally far away take all or none, or the order of vertices decides.
+    beyond = straight[:, -1:] if width == config.nearest + 2 else np.inf
     passed = (
         (candidate != own)
+        & (straight < beyond * (1 - 1e-6))
         & (island[candidate] == island[:, None])
         & ((normals[candidate] * normals[:, None]).sum(axis=2) >= config.min_cosine)
         & ~(mesh[:, None, :] == candidate[:, :, None]).any(axis=2)

@@ -10,6 +10,7 @@ import copy
 import json
 import os
 import time
+import zlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
@@ -29,7 +30,7 @@ from skinlib.graph import GraphConfig, HybridGraph, build_graph
 from skinlib.head import Head, HeadError
 from skinlib.losses import LossWeights, supervised
 from skinlib.model import ModelConfig, SkinningModel
-from skinlib.model.inputs import mesh_input, skeleton_input
+from skinlib.model.inputs import content_hash, mesh_input, skeleton_input
 from skinlib.paths import checkpoint
 
 STATE = "training.safetensors"
@@ -47,7 +48,7 @@ class TrainConfig:
     batch: int = 2  # heads a step
     judged_nodes: int = 1024  # nodes of a head whose weights enter the loss
     optimizer: str = "muon"  # muon: for matrices, with AdamW for the rest; or adamw
-    learning_rate: float = 3e-3  # after the warm-up
+    learning_rate: float = 5e-3  # after the warm-up
     weight_decay: float = 0.01  # pull of every parameter towards 0
     warmup: int = 100  # steps over which the learning rate rises
     cooldown: float = 0.5  # last part of the run, in which the learning rate falls to 0
@@ -56,7 +57,7 @@ class TrainConfig:
     seed: int = 0  # of parameters, order and augmentation
     threads: int = min(2, os.cpu_count() or 1)  # heads differentiated at once
     device: str = "cpu"  # cpu, cuda, cuda:1, ...
-    validation_share: float = 0.15  # of the heads, when no validation heads are given
+    validation_share: float = 0.08  # of the heads, when no validation heads are given
     validations: int = 20  # how often the run is validated
     save_seconds: float = 60.0  # how often the state to resume from is written
     unlabelled_share: float = 0.25  # of the draws, when unlabelled heads are given
@@ -81,7 +82,8 @@ def train(
 
     Args:
         labelled: heads with weights.
-        out: a folder; `load_model(out)` reads the best model so far at any time.
+        out: a folder; `load_model(out)` reads the best model so far, from the first
+            validation on.
         unlabelled: heads whose weights the averaged model guesses while it learns.
         validation: heads to judge by; None holds out whole topology groups.
         start: a model to begin from, such as a shipped checkpoint.
@@ -285,12 +287,10 @@ class Trainer:
         self.recent = 0.98 * getattr(self, "recent", error) + 0.02 * error
         done = self.steps_done if self.config.steps is not None else int(self.seconds)
         bar.update(max(0, min(done, bar.total) - bar.n))
-        bar.set_postfix(
-            step=self.steps_done,
-            row_l1=f"{self.recent:.4f}",
-            best=f"{self.best:.4f}",
-            refresh=False,
-        )
+        numbers = {"step": self.steps_done, "row_l1": f"{self.recent:.4f}"}
+        if np.isfinite(self.best):
+            numbers["validation"] = f"{self.best:.4f}"
+        bar.set_postfix(numbers, refresh=False)
 
     # -- judging and keeping -------------------------------------------------------
 
@@ -403,10 +403,18 @@ class Trainer:
         """What has to be the same for a run to be the same."""
         machine = ("threads", "device", "save_seconds")
         settings = {k: v for k, v in asdict(self.config).items() if k not in machine}
+        graph = self.model.config.graph
+        groups = {
+            "labelled": self.labelled,
+            "unlabelled": self.unlabelled,
+            "validation": self.validation,
+        }
         heads = {
-            "labelled": [h.name for h in self.labelled],
-            "unlabelled": [h.name for h in self.unlabelled],
-            "validation": [h.name for h in self.validation],
+            group: [
+                f"{head.name} {content_hash(head, graph)} {_checksum(head.weights)}"
+                for head in members
+            ]
+            for group, members in groups.items()
         }
         return json.loads(json.dumps(settings | heads))
 
@@ -486,6 +494,10 @@ def _optimizers(model: SkinningModel, config: TrainConfig):
         torch.optim.Muon(matrices, adjust_lr_fn="match_rms_adamw", **shared),
         torch.optim.AdamW(rest, betas=(0.9, 0.98), **shared),
     ]
+
+
+def _checksum(weights: np.ndarray | None) -> int:
+    return 0 if weights is None else zlib.crc32(weights.tobytes())
 
 
 def _check_labelled(heads: Sequence[Head]) -> None:

@@ -24,6 +24,11 @@ def moved(parents):
     return count
 
 
+def flip(features, columns):
+    features[:, columns] *= -1
+    return features
+
+
 def softmax(logits):
     weights = np.exp(logits - logits.max(axis=1, keepdims=True))
     return weights / weights.sum(axis=1, keepdims=True)
@@ -31,7 +36,7 @@ def softmax(logits):
 
 SOLUTIONS = {
     "04.1": moved,
-    "04.2": [7, 0, 3],
+    "04.2": lambda features: flip(features, [0, 3, 7]),
     "05.1": softmax,
     "05.2": lambda logits, allowed: softmax(np.where(allowed, logits, -np.inf)),
 }
@@ -43,10 +48,10 @@ WRONG = [
         lambda parents: [1 + sum(parents == b) for b in range(len(parents))],
         "grandchildren",
     ),
-    ("04.2", [0, 3, 6, 7], "as long as"),
-    ("04.2", [0], "three of the blocks"),
-    ("04.2", [0, 3, 7, 10], "two flags"),
-    ("04.2", ["x"], "ValueError"),
+    ("04.2", lambda features: flip(features, [0, 3, 6, 7]), "as long as"),
+    ("04.2", lambda features: flip(features, [0]), "each has an x"),
+    ("04.2", lambda features: flip(features, [0, 3, 7, 10]), "two flags"),
+    ("04.2", lambda features: features[0], "shape (12,)"),
     ("05.1", lambda logits: logits, "never negative"),
     ("05.1", lambda logits: np.exp(logits), "sums to 1"),
     ("05.1", lambda logits: np.ones_like(logits) / 2, "1/4 and 3/4"),

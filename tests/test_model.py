@@ -332,6 +332,16 @@ def test_cross_attention_in_chunks_is_the_same(head):
     torch.testing.assert_close(chunked, whole)
 
 
+def test_logits_of_some_nodes_are_rows_of_all(model, head):
+    mesh, bones = prepare(head)
+    nodes = torch.randperm(len(mesh.positions))[:50]
+    some, everyone = (
+        model.node_logits(mesh, bones, nodes),
+        model.node_logits(mesh, bones),
+    )
+    torch.testing.assert_close(some, everyone[nodes])
+
+
 def test_without_the_geometric_bias_only_features_speak():
     model = build(pair_width=0)
     assert not [n for n, _ in model.named_parameters() if ".pair" in n]

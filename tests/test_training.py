@@ -141,6 +141,12 @@ def test_an_augmentation_that_changes_the_mesh(heads, tmp_path):
     assert np.isfinite(model.predict(heads[0])).all()
 
 
+def test_few_or_more_judged_nodes_than_there_are(heads, tmp_path):
+    for judged in (1, 10**6):
+        config = replace(CONFIG_OF_TESTS, steps=1, judged_nodes=judged)
+        train(config, heads[:1], tmp_path / str(judged), validation=[])
+
+
 def test_the_average_follows_slowly(heads, tmp_path):
     config = replace(CONFIG_OF_TESTS, ema=0.05)
     trainer = Trainer(config, heads[:1], tmp_path, validation=[])

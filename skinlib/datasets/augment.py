@@ -35,17 +35,17 @@ _NOT_YET = np.zeros((0, 3), np.float32)  # normals that a later step computes
 class AugmentConfig:
     """How much of each change `augment` makes; 0 or False switches one off."""
 
-    collapse: float = 0.2  # chance that a head loses bones
+    collapse: float = 0.25  # chance that a head loses bones
     collapse_share: float = 0.1  # part of its bones that it then loses
     mirror: float = 0.5  # chance to swap left and right
     pose: float = 0.5  # chance to be posed; unlabelled heads never are
     pose_degrees: float = 4.0  # standard deviation of a posed bone's turn
-    warp: float = 0.6  # largest gradient of a smooth warp, below 1; drawn from 0 up
-    stretch: float = 0.08  # standard deviation of the log of each axis' scale
+    warp: float = 0.8  # largest gradient of a smooth warp, below 1; drawn from 0 up
+    stretch: float = 0.1  # standard deviation of the log of each axis' scale
     rotate: float = 5.0  # standard deviation of the turn of the whole head, degrees
     scale: float = 1.0  # largest factor up or down; the network knows no unit anyway
     jitter: float = 0.0005  # how far vertices move, in diagonals of the bounding box
-    joint_jitter: float = 0.003  # how far joints move, likewise
+    joint_jitter: float = 0.006  # how far joints move, likewise
     reorder_bones: bool = True  # put bones in random order
     # These change vertices or triangles: a graph has to be built anew.
     drop_islands: float = 0.0  # chance of each loose piece (eyes, hair) to go
