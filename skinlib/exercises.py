@@ -94,6 +94,83 @@ def same(found: Any, wanted: Any, tolerance: float = 1e-5) -> bool:
     return bool(np.allclose(found, wanted, rtol=tolerance, atol=tolerance))
 
 
+# ---- 00 quickstart
+
+
+@exercise("00.1")
+def _right_bone(right_bone: Callable) -> str | None:
+    """`right_bone(predicted, target)`: share of rows with the same largest bone."""
+    target = np.array([[0.6, 0.4], [0.3, 0.7], [0.9, 0.1], [0.2, 0.8]])
+    all_right = right_bone(target, target)
+    if same(all_right, 4):
+        return "divide by the number of vertices"
+    if not same(all_right, 1):
+        return "the artist's own weights are all right: the share is 1"
+    predicted = np.array([[0.9, 0.1], [0.8, 0.2], [0.6, 0.4], [0.4, 0.6]])
+    if not same(right_bone(predicted, target), 0.75):
+        return "three of four rows with the same largest bone are 0.75"
+    return None
+
+
+@exercise("00.2")
+def _keep_largest(keep_largest: Callable) -> str | None:
+    """`keep_largest(weights, count)`: the largest of each row, with sum 1 again."""
+    weights = np.array([[0.5, 0.125, 0.375], [0.2, 0.8, 0.0]])
+    kept = keep_largest(weights.copy(), 2)
+    if np.shape(kept) != weights.shape:
+        return f"shape (2, 3) went in, shape {np.shape(kept)} came out"
+    if kept[0][1] != 0:
+        return "the weight that is not among the largest becomes 0"
+    if not same(np.sum(kept, axis=1), [1, 1]):
+        return "divide each row by the sum that is left"
+    if not same(kept, [[4 / 7, 0, 3 / 7], [0.2, 0.8, 0]]):
+        return "each weight stays in its column"
+    if not same(keep_largest(weights, 1), [[1, 0, 0], [0, 1, 0]]):
+        return "with one bone a vertex, that bone has all the weight"
+    if weights[0, 1] != 0.125:
+        return "the input has changed: work on a copy"
+    return None
+
+
+# ---- 01 head data
+
+
+@exercise("01.1")
+def _soft_weights(soft_weights: Callable) -> str | None:
+    """`soft_weights(distances, power)`: rows in proportion to 1 / distance**power."""
+    weights = np.asarray(soft_weights(np.array([[1.0, 2.0], [3.0, 3.0]]), 1))
+    if weights.shape != (2, 2):
+        return f"two vertices and two bones go in, shape {weights.shape} came out"
+    if not same(weights.sum(axis=1), [1, 1]):
+        return "each row sums to 1: divide by the row's own sum, axis=1"
+    if not same(weights, [[2 / 3, 1 / 3], [0.5, 0.5]]):
+        return "twice as far is half the weight, when power is 1"
+    if not same(soft_weights(np.array([[1.0, 2.0]]), 2), [[0.8, 0.2]]):
+        return "twice as far is a quarter of the weight, when power is 2"
+    with np.errstate(all="ignore"):
+        touching = soft_weights(np.array([[0.0, 2.0]]), 2)
+    if not same(touching, [[1, 0]], 1e-3):
+        return "a vertex on a bone (distance 0) follows that bone alone, without NaN"
+    return None
+
+
+@exercise("01.2")
+def _merge_bone(merge_bone: Callable) -> str | None:
+    """`merge_bone(weights, parents, bone)`: the bone's weight goes to its parent."""
+    weights = np.array([[0.5, 0.25, 0.25], [0.0, 0.0, 1.0]])
+    parents = np.array([-1, 0, 1])
+    merged = np.asarray(merge_bone(weights, parents, 2))
+    if not same(weights, [[0.5, 0.25, 0.25], [0, 0, 1]]):
+        return "the input has changed: work on a copy"
+    if merged.shape != weights.shape:
+        return "the shape stays (V, J): the bone's column becomes 0"
+    if not same(merged.sum(axis=1), [1, 1]):
+        return "rows have to sum to 1 still: no weight may get lost"
+    if not same(merged, [[0.5, 0.5, 0], [0, 1, 0]]):
+        return "all of it goes to the bone's own parent, parents[bone]"
+    return None
+
+
 # ---- 02 hybrid graph
 
 

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+import torch
+from scipy.spatial import cKDTree
 
 from skinlib.exercises import CHECKS, check_exercise, exercise, same
 
@@ -13,6 +15,36 @@ def said(capsys, name, answer) -> str:
     number, verdict = lines[0].split(": ", 1)
     assert number == name
     return verdict
+
+
+def tree_nearest(points, k):
+    return cKDTree(points).query(points, k=k + 1)[1][:, 1:]
+
+
+def nearest(points, k):
+    apart = np.linalg.norm(points[:, None] - points, axis=2)
+    np.fill_diagonal(apart, np.inf)
+    return np.argsort(apart, axis=1)[:, :k]
+
+
+def table_hops(neighbours, start, unreached=-1):
+    steps = np.full(len(neighbours), unreached)
+    wave, step = np.array([start]), 0
+    while len(wave):
+        steps[wave], step = step, step + 1
+        wave = np.unique(neighbours[wave])
+        wave = wave[steps[wave] == unreached]
+    return steps
+
+
+def mean_conv(x, neighbours, used):
+    heard = (x[neighbours] * used[..., None]).sum(dim=1)
+    return heard / used.sum(dim=1, keepdim=True).clamp(min=1)
+
+
+def max_gradient(values, neighbours, upstream):
+    source = neighbours.gather(1, values[neighbours].argmax(dim=1))
+    return torch.zeros_like(values).scatter_add(0, source, upstream)
 
 
 def moved(parents):
@@ -34,13 +66,87 @@ def softmax(logits):
     return weights / weights.sum(axis=1, keepdims=True)
 
 
+def right_bone(predicted, target):
+    return np.mean(predicted.argmax(axis=1) == target.argmax(axis=1))
+
+
+def keep_largest(weights, count):
+    kept = np.where(weights >= np.sort(weights, axis=1)[:, [-count]], weights, 0)
+    return kept / kept.sum(axis=1, keepdims=True)
+
+
+def soft_weights(distances, power):
+    closeness = np.maximum(distances, 1e-9) ** -power
+    return closeness / closeness.sum(axis=1, keepdims=True)
+
+
+def merge_bone(weights, parents, bone):
+    merged = weights.copy()
+    merged[:, parents[bone]] += merged[:, bone]
+    merged[:, bone] = 0
+    return merged
+
+
+def merged_in_place(weights, parents, bone):
+    weights[:] = merge_bone(weights, parents, bone)
+    return weights
+
+
 SOLUTIONS = {
+    "00.1": right_bone,
+    "00.2": keep_largest,
+    "01.1": soft_weights,
+    "01.2": merge_bone,
+    "02.1": nearest,
+    "02.2": table_hops,
+    "03.1": mean_conv,
+    "03.2": max_gradient,
     "04.1": moved,
     "04.2": lambda features: flip(features, [0, 3, 7]),
     "05.1": softmax,
     "05.2": lambda logits, allowed: softmax(np.where(allowed, logits, -np.inf)),
 }
 WRONG = [
+    ("00.1", lambda p, t: len(t) * right_bone(p, t), "divide"),
+    ("00.1", lambda p, t: 0.0, "the share is 1"),
+    ("00.1", lambda p, t: np.mean(p == t), "0.75"),
+    ("00.2", lambda weights, count: weights, "becomes 0"),
+    ("00.2", lambda weights, count: weights[:, :count], "shape (2, 2)"),
+    ("00.2", lambda weights, count: keep_largest(weights, 2) * 0.5, "that is left"),
+    ("01.1", lambda distances, power: distances[0], "shape (2,)"),
+    ("01.1", lambda distances, power: 1 / distances, "sums to 1"),
+    ("01.1", lambda distances, power: np.full((2, 2), 0.5), "half the weight"),
+    ("01.1", lambda distances, power: soft_weights(distances, 1), "a quarter"),
+    ("01.1", lambda d, p: d**-p / (d**-p).sum(axis=1, keepdims=True), "distance 0"),
+    ("01.2", merged_in_place, "has changed"),
+    ("01.2", lambda weights, *bone: weights[:, :2], "stays (V, J)"),
+    ("01.2", lambda weights, *bone: weights * [1, 1, 0], "get lost"),
+    ("01.2", lambda weights, *bone: weights @ np.eye(3)[[0, 1, 0]], "own parent"),
+    ("02.1", lambda points, k: cKDTree(points).query(points, k=k)[1], "own neighbour"),
+    ("02.1", lambda points, k: nearest(points, k + 1), "shape (5, 3)"),
+    ("02.1", lambda points, k: nearest(points, k)[:, ::-1], "comes first"),
+    ("02.1", tree_nearest, "at one place"),
+    ("02.1", lambda points, k: nearest(points[:, :1], k), "all three"),
+    ("02.2", lambda table, start: table_hops(table, 0), "any node"),
+    ("02.2", lambda table, start: table_hops(table, start, -2), "is -1"),
+    ("02.2", lambda table, start: table_hops(table, start) + 1, "it is 0"),
+    ("03.1", lambda x, table, used: x[table].mean(dim=1), "gets 0"),
+    (
+        "03.1",
+        lambda x, table, used: (x[table] * used[..., None]).mean(dim=1),
+        "not by K",
+    ),
+    (
+        "03.1",
+        lambda x, table, used: x[table].mean(dim=1) * used.any(1, keepdim=True),
+        "must not matter",
+    ),
+    ("03.2", lambda values, table, upstream: upstream, "several rows"),
+    (
+        "03.2",
+        lambda *given: max_gradient(*given) * 0 + max_gradient(*given)[:, :1],
+        "own winner",
+    ),
     ("04.1", lambda parents: 1, "single bone"),
     ("04.1", lambda parents: np.ones(len(parents)), "moves three"),
     (
