@@ -153,7 +153,7 @@ def train(
     teach more than many sculpts of one mesh.
 
     For example:
-      skinlib train --labelled my_heads --out runs/mine --start default --minutes 10
+      skinlib train --labelled my_heads --out runs/mine --start heads --minutes 10
       skinlib train --labelled my_heads --out runs/scratch --minutes 30
       skinlib skin new.glb skinned.glb --checkpoint runs/mine
 

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
@@ -338,7 +338,7 @@ class Trainer:
         }
         tensors = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
         _write(self.out / STATE, tensors, {"progress": json.dumps(progress)})
-        _write_text(self.out / HISTORY, json.dumps(self.history, indent=1))
+        _replace(self.out / HISTORY, json.dumps(self.history, indent=1).encode())
 
     def _resume(self) -> None:
         tensors, metadata = _read(self.out / STATE)
@@ -427,7 +427,7 @@ def save_model(model: SkinningModel, folder: str | Path, extra: dict) -> None:
     config = json.dumps({"model": model.describe()} | extra, indent=1)
     # The weights carry their own configuration, so the two files cannot disagree.
     _write(folder / WEIGHTS, tensors, {"config": config})
-    _write_text(folder / CONFIG, config + "\n")
+    _replace(folder / CONFIG, f"{config}\n".encode())
 
 
 def load_model(name: str | Path) -> SkinningModel:
@@ -439,16 +439,18 @@ def load_model(name: str | Path) -> SkinningModel:
     Raises:
         HeadError: there is no such checkpoint, or the file is damaged.
     """
-    path = Path(name)
-    if path.is_dir() or path.parent != Path("."):
-        path = path if path.suffix == ".safetensors" else path / WEIGHTS
-    elif path.suffix != ".safetensors":
-        path = checkpoint(str(name)) / WEIGHTS
+    folder = Path(name)
+    path = folder if folder.suffix == ".safetensors" else folder / WEIGHTS
+    # Somebody's folder of heads may have the name of a shipped checkpoint.
+    if not path.is_file() and not (folder / STATE).exists():
+        if str(name) == folder.name and folder != path:
+            path = checkpoint(folder.name) / WEIGHTS
     if not path.is_file():
         raise HeadError(
             "checkpoint",
             "there is no such file",
-            "give the folder that `skinlib train --out` wrote, or a shipped name",
+            "give a folder that `skinlib train --out` wrote (a model is there from the "
+            "first validation on), or a shipped name",
             path,
         )
     tensors, metadata = _read(path)
@@ -515,15 +517,24 @@ def _check_labelled(heads: Sequence[Head]) -> None:
 
 
 def _write(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
-    partial = path.with_suffix(".partial")
-    save_file(tensors, partial, metadata)
-    os.replace(partial, path)
+    # As bytes: `save_file` would make a file that nobody else may read.
+    _replace(path, save(tensors, metadata))
 
 
-def _write_text(path: Path, text: str) -> None:
+def _replace(path: Path, content: bytes) -> None:
+    """Write a file that appears whole or not at all."""
     partial = path.with_suffix(".partial")
-    partial.write_text(text)
-    os.replace(partial, path)
+    try:
+        partial.write_bytes(content)
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise HeadError(
+            "checkpoint",
+            f"it cannot be written ({error.strerror})",
+            "make space and permissions, then the same command goes on",
+            path,
+        ) from error
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
