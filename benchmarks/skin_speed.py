@@ -62,7 +62,9 @@ def main() -> None:
             ),
             "robust_transfer": lambda: baselines.robust_transfer(head, templates[0]),
         }
-        print(json.dumps({name: median_seconds(f) for name, f in rows.items()}, indent=1))
+        print(
+            json.dumps({name: median_seconds(f) for name, f in rows.items()}, indent=1)
+        )
 
 
 if __name__ == "__main__":

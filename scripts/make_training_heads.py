@@ -1,10 +1,15 @@
-"""Make anny heads to train on, and four remeshed sets of unseen people to judge by.
+"""Make the heads that the shipped network learns from, and those it is judged by.
 
-    python scripts/make_training_heads.py runs/anny
+    python scripts/make_training_heads.py runs/heads [--own DIR]
 
-Writes `train/` (160 heads, each remeshed in another way) and `test_halved/`,
-`test_subdivided/`, `test_isotropic/`, `test_shuffled/` (the same 12 unseen people in
-each). The first call builds anny's cache, which takes minutes. anny is CC0.
+Writes into runs/heads:
+
+    train/             anny heads, each remeshed in another way, and synthetic heads;
+                       with --own also two remeshed copies of each head in DIR
+    test_halved/ test_subdivided/ test_isotropic/ test_shuffled/
+                       the same 12 unseen anny people, remeshed in four ways
+
+The first call builds anny's cache, which takes minutes. anny is CC0.
 """
 
 import argparse
@@ -14,11 +19,14 @@ import numpy as np
 from tqdm import tqdm
 
 from skinlib.datasets.anny import AnnyConfig, anny_heads
+from skinlib.datasets.folder import load_folder
 from skinlib.datasets.remesh import REMESHERS, halve, isotropic
+from skinlib.datasets.synthetic import synthetic_heads
 from skinlib.head import Head
 from skinlib.io import write_head
 
 TEST_SEED = 10_000
+SYNTHETIC_SEED = 100
 KINDS = {
     "original": 0.15,
     "halved": 0.3,
@@ -30,19 +38,18 @@ KINDS = {
 
 def people(first: int, count: int, busts: bool) -> list[Head]:
     """Heads of seeds `first` on: every other one with helper bones, a third busts."""
-    heads = []
-    for seed in range(first, first + count):
-        bust = busts and seed % 3 == 0
-        config = AnnyConfig(helper_bones=seed % 2 == 0, bust=bust)
-        heads.append((seed, config))
-    drawn = {config: anny_heads(count, first, config) for config in {c for _, c in heads}}
-    return [drawn[config][seed - first] for seed, config in heads]
+    configs = [
+        AnnyConfig(helper_bones=seed % 2 == 0, bust=busts and seed % 3 == 0)
+        for seed in range(first, first + count)
+    ]
+    drawn = {config: anny_heads(count, first, config) for config in set(configs)}
+    return [drawn[config][i] for i, config in enumerate(configs)]
 
 
 def remeshed(head: Head, seed: int) -> tuple[str, Head]:
     """A head with another topology, and the name of what was done."""
     rng = np.random.default_rng([seed, 9])
-    kind = rng.choice(list(KINDS), p=list(KINDS.values()))
+    kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
     if kind == "halved":
         return kind, halve(head, rng, keep=rng.uniform(0.35, 0.8))
     if kind == "isotropic":
@@ -51,19 +58,31 @@ def remeshed(head: Head, seed: int) -> tuple[str, Head]:
 
 
 def main() -> None:
-    """Write all five folders."""
+    """Write all folders."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path)
-    parser.add_argument("--count", type=int, default=160, help="heads to train on")
-    arguments = parser.parse_args()
-    out = arguments.out
-    (out / "train").mkdir(parents=True, exist_ok=True)
-    for seed, head in enumerate(tqdm(people(0, arguments.count, True), "train")):
+    parser.add_argument("--own", type=Path, help="a folder of your own skinned heads")
+    parser.add_argument("--anny", type=int, default=160, help="anny heads to train on")
+    parser.add_argument("--synthetic", type=int, default=16, help="synthetic ones")
+    options = parser.parse_args()
+
+    train = options.out / "train"
+    train.mkdir(parents=True, exist_ok=True)
+    for seed, head in enumerate(tqdm(people(0, options.anny, True), "anny")):
         kind, head = remeshed(head, seed)
-        write_head(out / "train" / f"anny_{seed:05d}_{kind}.npz", head)
+        write_head(train / f"anny_{seed:05d}_{kind}.npz", head)
+    for i, head in enumerate(synthetic_heads(options.synthetic, SYNTHETIC_SEED)):
+        write_head(train / f"synthetic_{i:02d}.npz", head)
+    for i, head in enumerate(tqdm(load_folder(options.own) if options.own else [])):
+        rng = np.random.default_rng(i)
+        half = halve(head, rng, keep=rng.uniform(0.4, 0.8))
+        even = isotropic(head, rng, vertices=int(rng.uniform(1200, 3000)))
+        write_head(train / f"{head.name}__halved.npz", half)
+        write_head(train / f"{head.name}__isotropic.npz", even)
+
     unseen = people(TEST_SEED, 12, False)
     for kind, remesh in REMESHERS.items():
-        folder = out / f"test_{kind}"
+        folder = options.out / f"test_{kind}"
         folder.mkdir(exist_ok=True)
         for i, head in enumerate(tqdm(unseen, folder.name)):
             path = folder / f"anny_{TEST_SEED + i}.npz"

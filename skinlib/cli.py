@@ -6,6 +6,7 @@ Everything slow to import is imported when a command runs, so that `--help` is q
 
 import json
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -57,10 +58,20 @@ def skin(
         lock: Bones whose weights in IN stay exactly as they are painted.
         symmetric: Same weights on the left and on the right, where the mesh has both.
     """
-    from skinlib.io import read_head, write_head
+    from skinlib.gltf import MAX_ELEMENTS
+    from skinlib.io import check_target, read_head, write_head
     from skinlib.training import load_model
 
+    check_target(target)
     head = read_head(source)
+    count, bones = len(head.vertices), len(head.skeleton)
+    if count * bones > MAX_ELEMENTS:
+        raise HeadError(
+            "weights",
+            f"{count:,} vertices times {bones:,} bones are too many",
+            f"stay below {MAX_ELEMENTS:,} weights: export the head alone",
+            source,
+        )
     locked = _locked_bones(head, lock, source)
     if max_influences is not None and max_influences < 1:
         raise HeadError(
@@ -72,10 +83,7 @@ def skin(
     skinned = head.replace(weights=weights)
     write_head(target, skinned, source=source if both_glb else None)
     used = int((weights > 0).sum(axis=1).max())
-    print(
-        f"{target}: {len(head.vertices):,} vertices, {len(head.skeleton)} bones, "
-        f"at most {used} a vertex"
-    )
+    print(f"{target}: {count:,} vertices, {bones:,} bones, at most {used} a vertex")
 
 
 def finish(
@@ -171,8 +179,12 @@ def train(
     from skinlib import training
     from skinlib.datasets.folder import load_folder
 
-    if minutes <= 0:
+    if not 0 < minutes < float("inf"):
         raise HeadError("--minutes", f"{minutes:g}", "give more than 0")
+    if threads < 1:
+        raise HeadError("--threads", f"{threads}", "give 1 or more")
+    if not 0 <= seed < 2**32:
+        raise HeadError("--seed", f"{seed}", "give 0 to 4294967295")
     config = training.TrainConfig(
         minutes=minutes, seed=seed, device=_device(device), threads=threads
     )
@@ -194,7 +206,7 @@ def _device(name: str) -> str:
     import torch
 
     try:
-        torch.zeros(1, device=name)
+        torch.zeros(1, device=name).item()
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         raise HeadError(
             "--device",
@@ -228,6 +240,7 @@ def evaluate(
     """
     from skinlib.datasets.folder import load_folder
     from skinlib.evaluate import compare
+    from skinlib.io import atomic
     from skinlib.training import load_model
 
     if json_file and not json_file.parent.is_dir():
@@ -241,7 +254,8 @@ def evaluate(
     )
     print(compare.format_table(scores))
     if json_file:
-        json_file.write_text(json.dumps(scores, indent=1) + "\n")
+        with atomic(json_file) as file:
+            file.write(f"{json.dumps(scores, indent=1)}\n".encode())
 
 
 def demo(*, out: Folder = Path("demo")) -> None:
@@ -278,6 +292,13 @@ def main(args: Sequence[str] | None = None) -> None:
     """Run a command; bad input ends in one line on stderr and exit status 2."""
     # The cores are shared with whatever else runs; threads that spin would take them.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # A progress bar that goes to a file: a line every ten seconds is enough.
+    if not sys.stderr.isatty():
+        os.environ.setdefault("TQDM_MININTERVAL", "10")
+    # A file name need not be text that the terminal can show.
+    sys.stdout.reconfigure(errors="backslashreplace")
+    # `kill` and `timeout` stop a command as Ctrl-C does.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         tyro.extras.subcommand_cli_from_dict(
             COMMANDS,
@@ -286,8 +307,13 @@ def main(args: Sequence[str] | None = None) -> None:
             args=args,
             config=(FlagCreatePairsOff,),
         )
-    except (HeadError, OSError) as error:
+    except (HeadError, OSError, FloatingPointError) as error:
+        if isinstance(error, OSError) and error.filename:
+            error = f"{error.filename}: {error.strerror}"
         print(f"skinlib: {error}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
+    except MemoryError:
+        print("skinlib: there is not enough memory for this head", file=sys.stderr)
         sys.exit(BAD_INPUT)
     except KeyboardInterrupt:
         print("skinlib: stopped", file=sys.stderr)

@@ -447,6 +447,12 @@ class _Binding:
                 self.document.tree.skins[self.skin_ids[0]]
             )
             if inverse_bind is not None:
+                if (np.linalg.det(inverse_bind[:, :3, :3]) == 0).any():
+                    self.document.fail(
+                        "inverseBindMatrices",
+                        "one of them cannot be inverted",
+                        "bind the mesh again, without a bone of scale 0",
+                    )
                 return -np.linalg.solve(
                     inverse_bind[:, :3, :3], inverse_bind[:, :3, 3, None]
                 )[:, :, 0]

@@ -6,6 +6,7 @@ row of weights is a probability distribution over bones.
 """
 
 import dataclasses
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,9 +108,12 @@ class Skeleton:
                 file,
             )
         _bounded(tails[~np.isnan(tails)], "bone_tails", file)
-        for bone in np.flatnonzero(np.isnan(tails).any(axis=1)):
-            children = joints[parents == bone]
-            tails[bone] = children.mean(axis=0) if len(children) else joints[bone]
+        child = np.flatnonzero(parents >= 0)
+        ends, children = np.zeros_like(joints), np.zeros((count, 1), np.float32)
+        np.add.at(ends, parents[child], joints[child])
+        np.add.at(children, parents[child], 1)
+        ends = np.where(children > 0, ends / np.maximum(children, 1), joints)
+        tails = np.where(np.isnan(tails).any(axis=1, keepdims=True), ends, tails)
 
         offsets = tails.astype(np.float64) - joints
         lengths = np.linalg.norm(offsets, axis=1)
@@ -138,11 +142,10 @@ class Skeleton:
     @property
     def depths(self) -> np.ndarray:
         """(J,) int64, the number of ancestors of each bone."""
-        depths = np.zeros(len(self), np.int64)
-        ancestor = self.parents.copy()
+        ancestor, depths = self.parents, (self.parents >= 0).astype(np.int64)
         while (ancestor >= 0).any():
-            depths += ancestor >= 0
-            ancestor = np.where(ancestor >= 0, self.parents[ancestor], -1)
+            depths = depths + np.where(ancestor >= 0, depths[ancestor], 0)
+            ancestor = _twice_as_far(ancestor)
         return depths
 
     def children(self) -> list[list[int]]:
@@ -316,8 +319,8 @@ def _forest(parents, count, file) -> np.ndarray:
             file,
         )
     ancestor = parents
-    for _ in range(count):
-        ancestor = np.where(ancestor >= 0, parents[ancestor], -1)
+    for _ in range(count.bit_length()):
+        ancestor = _twice_as_far(ancestor)
     if (ancestor >= 0).any():
         bone = int(np.flatnonzero(ancestor >= 0)[0])
         raise HeadError(
@@ -329,6 +332,11 @@ def _forest(parents, count, file) -> np.ndarray:
     return parents
 
 
+def _twice_as_far(ancestor: np.ndarray) -> np.ndarray:
+    """From each bone's n-th ancestor to the 2n-th; -1 when there is none."""
+    return np.where(ancestor >= 0, ancestor[ancestor], -1)
+
+
 def _names(names, count, file) -> tuple[str, ...]:
     names = tuple(str(name) for name in names)
     if len(names) != count:
@@ -338,13 +346,13 @@ def _names(names, count, file) -> tuple[str, ...]:
             "give one name per bone",
             file,
         )
-    for name in names:
+    for name, uses in Counter(names).items():
         if not name:
             raise HeadError("bone_names", "an empty name", "name every bone", file)
-        if names.count(name) > 1:
+        if uses > 1:
             raise HeadError(
                 "bone_names",
-                f"{name!r} is used {names.count(name)} times",
+                f"{name!r} is used {uses} times",
                 "give each bone a name of its own",
                 file,
             )

@@ -74,6 +74,23 @@ def write_head(
         )
 
 
+def check_target(path: str | Path) -> None:
+    """Tell before long work what would keep `write_head` from writing.
+
+    Raises:
+        HeadError: a wrong ending, or a folder that cannot be written to.
+    """
+    _by_suffix({".npz": write_npz, ".glb": write_glb}, path)
+    folder = Path(path).parent
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise HeadError(
+            "file",
+            f"the folder {str(folder)!r} does not exist or is read-only",
+            "choose a folder that exists and may be written to",
+            path,
+        )
+
+
 def _by_suffix(functions: dict[str, Callable], path: str | Path) -> Callable:
     suffix = Path(path).suffix.lower()
     if suffix not in functions:
@@ -191,7 +208,7 @@ def write_npz(path: str | Path, head: Head, max_influences: int | None = None) -
         weights = np.zeros_like(head.weights)
         np.add.at(weights, (np.arange(len(weights))[:, None], bones), values)
         arrays["weights"] = weights
-    with _atomic(path) as file:
+    with atomic(path) as file:
         np.savez_compressed(file, **arrays)
 
 
@@ -233,7 +250,7 @@ def write_glb(
         source = _existing_file(source)
         with _malformed(source, "export it again as binary glTF 2.0"):
             content = gltf.reskinned(source, head, max_influences)
-    with _atomic(path) as file:
+    with atomic(path) as file:
         file.write(content)
 
 
@@ -269,7 +286,7 @@ def _malformed(path: Path, fix: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _atomic(path: str | Path) -> Iterator[BinaryIO]:
+def atomic(path: str | Path) -> Iterator[BinaryIO]:
     """A file to write to, which becomes `path` when all went well."""
     path = Path(path)
     if path.is_dir():

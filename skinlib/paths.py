@@ -31,7 +31,8 @@ def repository_file(*parts: str) -> Path:
             "it ships in the repository: clone that and `pip install -e .` there",
             folder,
         )
-    shipped = sorted(file.name for file in folder.iterdir() if file.name[0].isalnum())
+    # Not README.md and SHA256SUMS.
+    shipped = sorted(file.name for file in folder.iterdir() if file.stem.islower())
     raise HeadError(
         parts[0],
         f"there is no {'/'.join(parts[1:])!r} in it",

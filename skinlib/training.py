@@ -6,12 +6,15 @@ summed in a fixed order. So a run that was interrupted ends in the same bits as 
 was not, and the number of threads changes the time, not the result.
 """
 
+import contextlib
 import copy
 import json
 import os
+import signal
+import threading
 import time
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -118,6 +121,7 @@ class Trainer:
         self.config, self.out = config, Path(out)
         self.labelled, self.unlabelled = labelled, list(unlabelled)
         self.validation = list(validation)
+        _check_weights(self.validation, "judge by skinned heads")
         self.graphs: dict[int, HybridGraph] = {}
 
         torch.manual_seed(config.seed)
@@ -134,6 +138,7 @@ class Trainer:
         if config.steps is not None:
             self.cooldown_start = int(config.steps * (1 - config.cooldown))
         self.best = float("inf")
+        self.recent: float | None = None  # running mean of the training row-L1
         self.history: list[dict] = []
         self._pool = None
         if (self.out / STATE).exists():
@@ -149,12 +154,13 @@ class Trainer:
             self._pool = pool
             try:
                 while not self.finished:
+                    # First, as the run may have been stopped when it was due.
+                    if self._validation_due():
+                        self.validate()
                     began = time.monotonic()
                     error = self.step()
                     self.seconds += time.monotonic() - began
                     self._show(bar, error)
-                    if self._validation_due():
-                        self.validate()
                     if time.monotonic() - saved > self.config.save_seconds:
                         self.save()
                         saved = time.monotonic()
@@ -213,6 +219,12 @@ class Trainer:
                 f"the gradient of step {self.steps_done} is not finite: "
                 f"lower learning_rate ({self.config.learning_rate})"
             )
+        with _uninterrupted():
+            self._update()
+        return float(np.mean(errors))
+
+    def _update(self) -> None:
+        """Follow the gradients; the averaged parameters follow slowly."""
         for optimizer in self.optimizers:
             for group in optimizer.param_groups:
                 group["lr"] = self.learning_rate
@@ -223,7 +235,6 @@ class Trainer:
             pairs = zip(self.average.parameters(), self.parameters, strict=True)
             for slow, fast in pairs:
                 slow.lerp_(fast, 1 - decay)
-        return float(np.mean(errors))
 
     def _gradient(self, draw: int) -> tuple[tuple[Tensor, ...], float]:
         """Gradient and row-L1 of one disturbed head; `draw` decides which and how."""
@@ -284,7 +295,8 @@ class Trainer:
         return tqdm(total=total, initial=min(initial, total), unit="s")
 
     def _show(self, bar, error: float) -> None:
-        self.recent = 0.98 * getattr(self, "recent", error) + 0.02 * error
+        before = error if self.recent is None else self.recent
+        self.recent = 0.98 * before + 0.02 * error
         done = self.steps_done if self.config.steps is not None else int(self.seconds)
         bar.update(max(0, min(done, bar.total) - bar.n))
         numbers = {"step": self.steps_done, "row_l1": f"{self.recent:.4f}"}
@@ -305,18 +317,19 @@ class Trainer:
             for head in self.validation
         ]
         error = float(np.mean(errors)) if errors else float("nan")
+        # In this order: whoever is stopped in between validates once more.
+        if error < self.best or not errors:
+            trained = asdict(self.config) | {"model": self.average.describe()}
+            save_model(self.average, self.out, {"training": trained})
+            self.best = error
         self.history.append(
             {
                 "step": self.steps_done,
                 "minutes": round(self.seconds / 60, 3),
-                "train_row_l1": round(getattr(self, "recent", float("nan")), 5),
-                "validation_row_l1": round(error, 5),
+                "train_row_l1": self.recent and round(self.recent, 5),
+                "validation_row_l1": round(error, 5) if errors else None,
             }
         )
-        if error < self.best or not errors:
-            self.best = error
-            trained = asdict(self.config) | {"model": self.average.describe()}
-            save_model(self.average, self.out, {"training": trained})
         return error
 
     def save(self) -> None:
@@ -333,7 +346,7 @@ class Trainer:
             "seconds": self.seconds,
             "cooldown_start": self.cooldown_start,
             "best": self.best,
-            "recent": getattr(self, "recent", None),
+            "recent": self.recent,
             "history": self.history,
         }
         tensors = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
@@ -389,8 +402,7 @@ class Trainer:
         self.steps_done, self.seconds = progress["steps_done"], progress["seconds"]
         self.cooldown_start = progress["cooldown_start"]
         self.best, self.history = progress["best"], progress["history"]
-        if progress["recent"] is not None:
-            self.recent = progress["recent"]
+        self.recent = progress["recent"]
 
     def _moments(self, parameter: Tensor) -> dict[str, Tensor]:
         """What the optimizer in charge of a parameter remembers of it."""
@@ -507,13 +519,35 @@ def _check_labelled(heads: Sequence[Head]) -> None:
         raise HeadError(
             "labelled", "there is no head to learn from", "give at least one head"
         )
+    _check_weights(
+        heads, "train on skinned heads; put heads without weights in --unlabelled"
+    )
+
+
+def _check_weights(heads: Sequence[Head], fix: str) -> None:
     for head in heads:
         if head.weights is None:
-            raise HeadError(
-                "weights",
-                f"head {head.name!r} has none",
-                "train on skinned heads; put heads without weights in --unlabelled",
-            )
+            raise HeadError("weights", f"head {head.name!r} has none", fix)
+
+
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Ctrl-C waits for the end of the block: nobody can go on from half an update."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    waiting: list[int] = []
+    usual = {
+        number: signal.signal(number, lambda number, _: waiting.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in usual.items():
+            signal.signal(number, handler)
+        for number in waiting:
+            signal.raise_signal(number)
 
 
 def _write(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
@@ -528,13 +562,15 @@ def _replace(path: Path, content: bytes) -> None:
         partial.write_bytes(content)
         os.replace(partial, path)
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise HeadError(
             "checkpoint",
             f"it cannot be written ({error.strerror})",
-            "make space and permissions, then the same command goes on",
+            "see to space and permissions, then run the same command again",
             path,
         ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink()
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -26,7 +26,7 @@ from skinlib.datasets.augment import (
 )
 from skinlib.datasets.synthetic import synthetic_head, synthetic_head_and_regions
 from skinlib.geometry import islands, vertex_normals, weld
-from skinlib.head import HeadError
+from skinlib.head import Head, HeadError, Skeleton
 
 STEPS = (
     "scale stretch rotate warp jitter pose mirror collapse_bones reorder_bones "
@@ -370,3 +370,10 @@ def test_a_seam_doubles_vertices_and_moves_nothing(head):
         islands(cut.faces, len(cut.vertices)).max()
         > islands(head.faces, len(head.vertices)).max()
     )
+
+
+def test_a_head_whose_vertices_lie_in_one_place():
+    bones = Skeleton.from_heads_and_tails(np.eye(2, 3), None, [-1, 0], "ab")
+    point = Head.create(np.ones((3, 3)), [[0, 1, 2]], bones, np.eye(2)[[0, 1, 0]])
+    for seed in range(20):
+        augment(point, np.random.default_rng(seed), AugmentConfig())  # no NaN

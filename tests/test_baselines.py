@@ -266,3 +266,10 @@ def test_templates_need_weights_and_there_must_be_one(head, template):
         template_copy(head, template.replace(weights=None))
     with pytest.raises(HeadError, match="there are none"):
         most_similar(head, [])
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_template_that_shares_no_bone_is_copied_without_a_warp(head, template):
+    one = Skeleton.from_heads_and_tails([[0, 0, 0]], None, [-1], ["elsewhere"])
+    alone = head.replace(skeleton=one, weights=np.ones((len(head.vertices), 1)))
+    np.testing.assert_allclose(warped_template_copy(alone, template), 1)

@@ -1,5 +1,7 @@
+import errno
 import inspect
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -7,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from skinlib import check, cli, demo
+from skinlib import check, cli, demo, gltf
 from skinlib.datasets.synthetic import synthetic_heads
 from skinlib.head import Head, HeadError, Skeleton
 from skinlib.io import read_head, write_head
@@ -28,6 +30,8 @@ def place(tmp_path_factory):
         write_head(folder / "heads" / f"head_{i}.npz", head)
     write_head(folder / "skinned.glb", heads[0])
     write_head(folder / "bare.npz", heads[0].replace(weights=None))
+    (folder / "bare").mkdir()
+    write_head(folder / "bare" / "head.npz", heads[0].replace(weights=None))
     save_model(SkinningModel(SMALL), folder / "network", {})
     return folder
 
@@ -164,24 +168,32 @@ def test_train_then_skin_with_it(run, place):
     assert load_model("new").config == SMALL
 
 
-def test_ctrl_c_stops_and_the_state_is_kept(place):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_stops_and_the_state_is_kept(place, number):
+    out = f"stopped_{number}"
     code = (
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from skinlib import cli\n"
-        "cli.main('train --labelled heads --out stopped --start network'.split())"
+        f"cli.main('train --labelled heads --out {out} --start network'.split())"
     )
     training = subprocess.Popen(
-        [sys.executable, "-c", code], cwd=place, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", code],
+        cwd=place,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"TQDM_MININTERVAL": "0.1"},
     )
     begun = ""
     while "step=" not in begun:  # the progress bar shows the first steps
-        begun = (begun + training.stderr.read(1))[-40:]
-    training.send_signal(signal.SIGINT)
+        read = training.stderr.read(1)
+        assert read, begun
+        begun += read
+    training.send_signal(number)
     _, stderr = training.communicate(timeout=60)
     assert training.returncode == 130
     assert "Traceback" not in stderr
     assert stderr.endswith("skinlib: stopped\n")
-    assert (place / "stopped" / "training.safetensors").is_file()
+    assert (place / out / "training.safetensors").is_file()
 
 
 def test_evaluate_writes_the_table_and_the_numbers(run, capsys):
@@ -219,6 +231,12 @@ def test_evaluate_writes_the_table_and_the_numbers(run, capsys):
         ("train --labelled nowhere --out new2", "nowhere"),
         ("train --labelled heads --out new2 --device quantum", "quantum"),
         ("train --labelled heads --out new2 --minutes -1", "--minutes"),
+        ("train --labelled heads --out new2 --minutes nan", "--minutes"),
+        ("train --labelled heads --out new2 --minutes inf", "--minutes"),
+        ("train --labelled heads --out new2 --threads 0", "--threads"),
+        ("train --labelled heads --out new2 --seed -1", "--seed"),
+        ("train --labelled heads --out new2 --device meta", "meta"),
+        ("train --labelled heads --out new2 --validation bare", "has none"),
         ("evaluate --heads network --checkpoint network", "network: folder"),
         (
             "evaluate --heads heads --checkpoint network --json no/where.json",
@@ -238,6 +256,46 @@ def test_bad_input_is_one_line_and_nothing_is_written(
     assert stderr.splitlines()[-1].startswith("skinlib: ")
     assert "Traceback" not in stderr
     assert sorted(place.rglob("*")) == before
+
+
+def test_scores_appear_whole_or_not_at_all(run, place, monkeypatch, capsys):
+    (place / "old.json").write_text("kept")
+
+    def full(*names):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    command = ("evaluate", "--heads", "heads", "--checkpoint", "network")
+    assert run(*command, "--json", "old.json") == 2
+    assert "No space left" in capsys.readouterr().err
+    assert (place / "old.json").read_text() == "kept"
+
+
+def test_a_target_that_cannot_be_written_is_told_before_the_work(run, monkeypatch):
+    monkeypatch.setattr(SkinningModel, "predict", None)
+    assert run("skin", "bare.npz", "no/out.glb", "--checkpoint", "network") == 2
+    assert run("skin", "bare.npz", "out.obj", "--checkpoint", "network") == 2
+
+
+def test_more_weights_than_a_file_holds_are_one_error(run, monkeypatch, capsys):
+    monkeypatch.setattr(gltf, "MAX_ELEMENTS", 5000)
+    assert run("skin", "bare.npz", "out.npz", "--checkpoint", "network") == 2
+    assert "vertices times 11 bones are too many" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere names are text")
+def test_a_file_name_that_is_no_text(run, place):
+    name = os.fsdecode(b"caf\xe9.glb")
+    (place / name).write_bytes((place / "skinned.glb").read_bytes())
+    assert run("skin", name, "new_" + name, "--checkpoint", "network") == 0
+    assert (place / ("new_" + name)).is_file()
+
+
+def test_a_bar_in_a_log_file_is_a_few_lines(place):
+    command = [sys.executable, "-m", "skinlib", "train", "--labelled", "heads"]
+    command += "--out logged --start network --minutes 0.03".split()
+    log = subprocess.run(command, capture_output=True, cwd=place).stderr
+    assert 1 <= log.count(b"\r") <= 4
 
 
 # -------------------------------------------------------------------------- demo, check

@@ -1,5 +1,7 @@
 """The data contract: what gets in, what is turned away, and with which words."""
 
+import time
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -59,6 +61,16 @@ def test_reordered_moves_everything_along():
 def test_two_hundred_bones_in_one_chain():
     bones = chain(range(-1, 199))
     assert bones.depths.tolist() == list(range(200))
+
+
+def test_many_bones_take_no_quadratic_time():
+    count = 100_000
+    start = time.perf_counter()
+    bones = chain(range(-1, count - 1))
+    assert bones.depths.tolist() == list(range(count))
+    with pytest.raises(HeadError, match="its own ancestor"):
+        chain([count - 1, *range(count - 1)])
+    assert time.perf_counter() - start < 10  # an hour, when every pair is looked at
 
 
 # ---------------------------------------------------------------- head, by hand

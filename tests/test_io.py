@@ -807,7 +807,7 @@ def zero_matrices(builder: Builder) -> None:
         (face_ids([0, 1, 6], "u1"), "faces: vertex id 6 with 6 vertices"),
         (face_ids([0, 1, 2, 3], "u1"), "faces: 4 vertex ids"),
         (face_ids([0, 1, 2], "f4"), "faces: 3 vertex ids of type float32"),
-        (zero_matrices, "malformed .*Singular"),
+        (zero_matrices, "inverseBindMatrices: one of them cannot be inverted"),
     ],
 )
 def test_bad_glb(tmp_path, change, words):

@@ -1,5 +1,6 @@
 """Training on tiny heads: it learns, stops anywhere, goes on, repeats to the bit."""
 
+import errno
 import json
 import os
 import shutil
@@ -14,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load_file, safe_open, save_file
 
-from skinlib import HeadError
+from skinlib import HeadError, training
 from skinlib.datasets.augment import AugmentConfig
 from skinlib.datasets.synthetic import synthetic_heads
 from skinlib.graph import GraphConfig
@@ -232,6 +233,39 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(
     assert mine == theirs
 
 
+@pytest.mark.parametrize("where", ["_optimizers", "predict", "save_model"])
+def test_an_interrupt_inside_an_update_or_a_validation(
+    heads, finished, tmp_path, monkeypatch, where
+):
+    pressed = []
+
+    def pressing(function):
+        def pressed_before(*args, **options):
+            if len(pressed) == 0:
+                pressed.append(True)
+                os.kill(os.getpid(), signal.SIGINT)
+            return function(*args, **options)
+
+        return pressed_before
+
+    with monkeypatch.context() as patch:
+        trainer = Trainer(CONFIG_OF_TESTS, heads[:2], tmp_path, validation=heads[2:])
+        if where == "predict":
+            patch.setattr(trainer.average, where, pressing(trainer.average.predict))
+        elif where == "save_model":
+            patch.setattr(training, where, pressing(save_model))
+        else:  # between two optimizers
+            last = trainer.optimizers[-1]
+            patch.setattr(last, "step", pressing(last.step))
+        with pytest.raises(KeyboardInterrupt):
+            trainer.run()
+    train(CONFIG_OF_TESTS, heads[:2], tmp_path, validation=heads[2:])
+    assert same_tensors(tmp_path / WEIGHTS, finished / WEIGHTS)
+    assert same_tensors(tmp_path / STATE, finished / STATE)
+    history = json.loads((tmp_path / HISTORY).read_text())
+    assert [validated["step"] for validated in history] == [4, 8]
+
+
 def test_a_run_with_unlabelled_heads_resumes_to_the_same_bits(
     heads, tmp_path, monkeypatch
 ):
@@ -403,8 +437,41 @@ def test_going_on_from_a_trained_model(heads, finished, tmp_path):
 
 @pytest.mark.parametrize("name", ["there_is_none", "a/b", "a.safetensors"])
 def test_a_checkpoint_that_is_not_there(name):
-    with pytest.raises(HeadError, match=r"missing|no such file"):
+    with pytest.raises(HeadError, match=r"missing|there is no"):
         load_model(name)
+
+
+def test_a_folder_named_like_a_shipped_checkpoint(finished, tmp_path, monkeypatch):
+    shipped = tmp_path / "shipped"
+    shutil.copytree(finished, shipped)
+    monkeypatch.setattr(training, "checkpoint", lambda name: tmp_path / "shipped")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "heads").mkdir()
+    assert load_model("heads").config == TINY
+    with pytest.raises(HeadError, match=r"^heads.model\.safetensors: .* no such file"):
+        load_model("./heads")
+    (tmp_path / "heads" / STATE).touch()  # a run that has not validated yet
+    with pytest.raises(HeadError, match="first validation"):
+        load_model("heads")
+
+
+def test_others_may_read_what_was_written(heads, tmp_path):
+    save_model(SkinningModel(TINY), tmp_path, {})
+    (tmp_path / "usual").touch()
+    assert (tmp_path / WEIGHTS).stat().st_mode == (tmp_path / "usual").stat().st_mode
+
+
+def test_a_full_disk_is_one_error_and_leaves_nothing(finished, tmp_path, monkeypatch):
+    out = shutil.copytree(finished, tmp_path / "run")
+    before = {file.name: file.read_bytes() for file in out.iterdir()}
+
+    def full(*names):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(HeadError, match="No space left"):
+        save_model(SkinningModel(TINY), out, {})
+    assert {file.name: file.read_bytes() for file in out.iterdir()} == before
 
 
 def damaged(file, how: str) -> None:

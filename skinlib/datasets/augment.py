@@ -442,4 +442,6 @@ def _centre(head: Head) -> np.ndarray:
 
 
 def _diagonal(head: Head) -> float:
-    return float(np.linalg.norm(np.ptp(head.vertices.astype(np.float64), axis=0)))
+    """Of the bounding box; 1 when all vertices lie in one place."""
+    size = np.linalg.norm(np.ptp(head.vertices.astype(np.float64), axis=0))
+    return float(size) or 1.0

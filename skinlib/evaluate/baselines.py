@@ -267,6 +267,8 @@ def _warp(template: Head, head: Head, bones: BoneMatch) -> np.ndarray:
     align = _align(template, head, bones)
     vertices = align(template.vertices)
     pairs = np.flatnonzero(bones.paired)
+    if len(pairs) == 0:
+        return vertices
     joints = align(template.skeleton.joints[pairs])
     wanted = head.skeleton.joints[bones.target[pairs]].astype(np.float64)
     size = _frame(head).scale
@@ -275,8 +277,6 @@ def _warp(template: Head, head: Head, bones: BoneMatch) -> np.ndarray:
     joints, wanted = joints[once] / size, wanted[once] / size
     # Four joints that span space fix the affine part; fewer only a shift.
     spans = np.linalg.matrix_rank(joints - joints.mean(axis=0), tol=1e-2) == 3
-    if len(joints) == 0:
-        return vertices
     spline = RBFInterpolator(
         joints, wanted - joints, kernel="linear", degree=1 if spans else 0
     )

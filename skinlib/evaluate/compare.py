@@ -106,7 +106,7 @@ def evaluate(
     for number, head in enumerate(labelled):
         others = [template for template in templates if not _same(template, head)]
         for name, method in chosen.items():
-            steps.set_postfix_str(f"{name} on {head.name}")
+            steps.set_postfix_str(f"{name} on {head.name}", refresh=False)
             steps.update()
             if name in TEMPLATE and not others:
                 continue

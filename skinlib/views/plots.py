@@ -277,7 +277,7 @@ def skeleton_tree(
     colours = [to_rgb(SERIES[0])] * len(skeleton) if colours is None else colours
     title = title or f"{len(skeleton)} bones, depth 0 to {depths.max()}"
     with new_figure(
-        1.9 + 1.35 * (depths.max() + 1), 0.9 + 0.19 * max(row, 4)
+        1.9 + 1.35 * (depths.max() + 1), 0.9 + 0.27 * max(row, 4)
     ) as figure:
         axes = figure.subplots()
         for bone, parent in enumerate(skeleton.parents):
