@@ -63,7 +63,7 @@ def skin(
     from skinlib.training import load_model
 
     check_target(target)
-    head = read_head(source)
+    head = read_head(source, weights=bool(lock))
     count, bones = len(head.vertices), len(head.skeleton)
     if count * bones > MAX_ELEMENTS:
         raise HeadError(

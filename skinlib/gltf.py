@@ -33,10 +33,10 @@ claim any size; what claims more than this is refused before memory is taken for
 EXTRAS_KEY = "skinlib"
 
 
-def read(path: Path) -> Head:
+def read(path: Path, weights: bool = True) -> Head:
     """Read a head; see `skinlib.io.read_glb`."""
     document = _Document(path)
-    return _head_from(document, _Binding(document))
+    return _head_from(document, _Binding(document), weights)
 
 
 # pygltflib leaves out two properties of the specification, which would be lost when a
@@ -487,9 +487,10 @@ class _Binding:
         return tuple(names)
 
 
-def _head_from(document: _Document, binding: _Binding) -> Head:
+def _head_from(document: _Document, binding: _Binding, weighted: bool) -> Head:
     skeleton = _skeleton_from(document, binding)
     vertices, normals, faces, weights = [], [], [], []
+    weighted = weighted and binding.skinned
     start = 0
     for block in binding.blocks:
         positions = document.array(block.attributes["POSITION"], "POSITION", "VEC3")
@@ -498,7 +499,7 @@ def _head_from(document: _Document, binding: _Binding) -> Head:
             normals.append(document.array(block.attributes["NORMAL"], "NORMAL", "VEC3"))
         for primitive in block.primitives:
             faces.append(_faces(document, primitive, len(positions)) + start)
-        if "JOINTS_0" in block.attributes and binding.skinned:
+        if "JOINTS_0" in block.attributes and weighted:
             weights.append(_weights(document, block, len(positions), len(skeleton)))
         start += len(positions)
     if weights and len(weights) < len(vertices):
@@ -712,7 +713,7 @@ def reskinned(source: Path, head: Head, max_influences: int | None) -> bytes:
         raise HeadError("weights", "the head has none", "predict or paint them first")
     document = _Document(source)
     binding = _Binding(document)
-    columns = _matching_bones(_head_from(document, binding), head, source)
+    columns = _matching_bones(_head_from(document, binding, False), head, source)
     _one_buffer(document)
     if not binding.skinned:
         _bind(document, binding)

@@ -31,14 +31,18 @@ NPZ_KEYS = (
 NPZ_OPTIONAL = {"normals", "bone_tails", "weights"}
 
 
-def read_head(path: str | Path) -> Head:
+def read_head(path: str | Path, weights: bool = True) -> Head:
     """Read a head from a `.npz`, `.glb` or `.gltf` file; its name is the file's stem.
+
+    Args:
+        weights: False passes the file's weights over, so that a head that is only
+            half painted can be read too.
 
     Raises:
         HeadError: the file cannot be read, or what it holds is not a head.
     """
     readers = {".npz": read_npz, ".glb": read_glb, ".gltf": read_glb}
-    return _by_suffix(readers, path)(path)
+    return _by_suffix(readers, path)(path, weights)
 
 
 def write_head(
@@ -106,7 +110,7 @@ def _by_suffix(functions: dict[str, Callable], path: str | Path) -> Callable:
 # --- .npz ---------------------------------------------------------------------------
 
 
-def read_npz(path: str | Path) -> Head:
+def read_npz(path: str | Path, weights: bool = True) -> Head:
     """Read a head from a `.npz` file with the arrays `NPZ_KEYS`; pickles are refused.
 
     `normals`, `bone_tails` and `weights` may be absent.
@@ -145,7 +149,7 @@ def read_npz(path: str | Path) -> Head:
                 _checked_names(names.tolist(), path),
                 file=path,
             ),
-            weights=arrays["weights"],
+            weights=arrays["weights"] if weights else None,
             normals=arrays["normals"],
             name=path.stem,
             file=path,
@@ -215,7 +219,7 @@ def write_npz(path: str | Path, head: Head, max_influences: int | None = None) -
 # --- glTF ---------------------------------------------------------------------------
 
 
-def read_glb(path: str | Path) -> Head:
+def read_glb(path: str | Path, weights: bool = True) -> Head:
     """Read a head from a `.glb` file, or from a `.gltf` file and what lies beside it.
 
     All meshes bound to the same skin become one head; its vertices are those of their
@@ -227,7 +231,7 @@ def read_glb(path: str | Path) -> Head:
     """
     path = _existing_file(path)
     with _malformed(path, "export it again as binary glTF 2.0"):
-        return gltf.read(path)
+        return gltf.read(path, weights)
 
 
 def write_glb(

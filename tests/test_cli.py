@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pygltflib
 import pytest
 
 from skinlib import check, cli, demo, gltf
@@ -110,6 +111,32 @@ def test_skin_writes_what_the_network_predicts(run, source, target):
     weights = skin(run, source, target)
     expected = load_model("network").predict(read_head(source))
     np.testing.assert_allclose(weights, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", ["npz", "glb"])
+def test_half_painted_head_is_skinned(run, place, capsys, suffix):
+    head = read_head(place / "heads" / "head_0.npz")
+    if suffix == "npz":
+        arrays = dict(np.load(place / "heads" / "head_0.npz"))
+        arrays["weights"][0] = 0
+        np.savez(place / "half.npz", **arrays)
+    else:
+        write_head(place / "half.glb", head)
+        document = pygltflib.GLTF2().load(place / "half.glb")
+        primitive = document.meshes[0].primitives[0]
+        accessor = document.accessors[primitive.attributes.WEIGHTS_0]
+        view = document.bufferViews[accessor.bufferView]
+        start = (view.byteOffset or 0) + (accessor.byteOffset or 0)
+        blob = bytearray(document.binary_blob())
+        blob[start : start + 16] = bytes(16)
+        document.set_binary_blob(bytes(blob))
+        document.save(place / "half.glb")
+    weights = skin(run, f"half.{suffix}", f"whole.{suffix}")
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-6)
+    # Locked bones are read from the file, which then has to be painted.
+    command = ("skin", f"half.{suffix}", "x.npz", "--checkpoint", "network")
+    assert run(*command, "--lock", head.skeleton.names[0]) == 2
+    assert "vertex 0 sums to 0" in capsys.readouterr().err
 
 
 def test_max_influences(run):
