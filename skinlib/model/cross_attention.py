@@ -52,7 +52,7 @@ class CrossAttention(nn.Module):
         bone_width: int = 128,
         pair_width: int = 32,
         heads: int = 4,
-        chunk: int = 100_000,
+        chunk: int = 32_768,
     ):
         super().__init__()
         self.chunk, self.pair_width = chunk, pair_width
@@ -68,9 +68,9 @@ class CrossAttention(nn.Module):
             self.pair_vertex = nn.Linear(mesh_width, pair_width, bias=False)
             self.pair_bone = nn.Linear(bone_width, pair_width, bias=False)
             self.pair_out = nn.Sequential(
-                nn.ReLU(),
+                nn.ReLU(inplace=True),
                 nn.Linear(pair_width, pair_width),
-                nn.ReLU(),
+                nn.ReLU(inplace=True),
                 nn.Linear(pair_width, 1),
             )
 
@@ -105,5 +105,7 @@ class CrossAttention(nn.Module):
         if not self.pair_width:
             return logits
         pair = self.pair(pair_features(positions, normals, skeleton))  # (N, J, P)
-        pair = pair + self.pair_vertex(vertices)[:, None] + self.pair_bone(bones)
+        # In place: each new (N, J, P) array costs more than the sum in it.
+        pair += self.pair_vertex(vertices)[:, None]
+        pair += self.pair_bone(bones)
         return logits + self.pair_out(pair).squeeze(2)
