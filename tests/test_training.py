@@ -50,6 +50,14 @@ CONFIG_OF_TESTS = TrainConfig(
 GENTLE = AugmentConfig(collapse=0, mirror=0, pose=0, warp=0.0, stretch=0.0, rotate=0.0)
 
 
+@pytest.fixture(autouse=True)
+def _interrupts_arrive():
+    """A shell that starts the tests in the background has them ignore Ctrl-C."""
+    usual = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, usual)
+
+
 @pytest.fixture(scope="module")
 def heads():
     return synthetic_heads(3, seed=1, vertices=600, bones=8)
