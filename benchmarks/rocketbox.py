@@ -50,8 +50,11 @@ class Run:
 def main(run: Run) -> None:
     """Split, train, judge, write."""
     labelled, held_out = split(load_folder(run.heads), run.fold)
+    # A remeshed copy is called NAME__HOW; a copy of a held-out head is held out too.
+    hidden = {head.name for head in held_out}
     extra = load_folder(run.extra) if run.extra else []
-    # Held-out heads are looked at once, after the last step: none of them chooses it.
+    extra = [head for head in extra if head.name.split("__")[0] not in hidden]
+    # No held-out head chooses the step that is kept: it is the last one.
     model = train(run.config, labelled + extra, run.out / "model", validation=[])
     result = evaluate(held_out, train_heads=labelled, model=model)
     result["held_out"] = [head.name for head in held_out]
