@@ -162,7 +162,7 @@ def _mesh_table(positions, edges, width):
     return neighbours, lengths
 
 
-def _gated_nearest(positions, normals, island, mesh, length, config, chunk=4096):
+def _gated_nearest(positions, normals, island, mesh, length, config, chunk=512):
     """(N, nearest + 2) nodes that pass the gates, nearest first, -1 elsewhere."""
     count = len(positions)
     width = min(config.nearest + 2, count)
@@ -185,8 +185,10 @@ def _gated_nearest(positions, normals, island, mesh, length, config, chunk=4096)
         goal = candidate[rows, places]
         # The shortest path of two mesh edges: meet at a common neighbour.
         meet = mesh[rows][:, :, None] == mesh[goal][:, None, :]  # (P, K, K)
-        path = length[rows][:, :, None] + length[goal][:, None, :]
-        shortest = np.where(meet, path, np.inf).min(axis=(1, 2), initial=np.inf)
+        pair, out, back = np.nonzero(meet)
+        path = length[rows[pair], out] + length[goal[pair], back]
+        shortest = np.full(len(rows), np.inf)
+        np.minimum.at(shortest, pair, path)
         far = shortest > config.max_detour * straight[rows, places]
         passed[rows[far], places[far]] = False
     return np.where(passed, candidate, -1)

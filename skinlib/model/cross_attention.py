@@ -7,29 +7,33 @@ from torch import Tensor, nn
 from skinlib.model.inputs import MeshInput, SkeletonInput
 from skinlib.model.layers import Attention, FeedForward
 
-# Offset to the joint, distance to the joint, to the segment, log of that, is the normal
-# turned to the joint.
-PAIR_FEATURES = 3 + 1 + 1 + 1 + 1
+# Distance to the joint, to the segment, log of that, is the normal turned to the joint.
+PAIR_FEATURES = 4
 
 
 def pair_features(
     positions: Tensor, normals: Tensor, skeleton: SkeletonInput
 ) -> Tensor:
-    """(N, J, 7): where each bone lies as seen from each node.
+    """(N, J, 4): where each bone lies as seen from each node.
 
-    The offset to the joint (3), the distance to it, the distance to the bone segment
-    and its logarithm, and the cosine between the normal and the way to the joint.
+    The distance to the joint, the distance to the bone segment and its logarithm, and
+    the cosine between the normal and the way to the joint.
     """
-    offset = skeleton.joints[None] - positions[:, None]  # (N, J, 3)
+    joints = skeleton.joints
     axis = skeleton.lengths[:, None] * skeleton.directions  # (J, 3)
     squared = (axis**2).sum(1)
-    along = -(offset * axis).sum(2) / torch.where(squared > 0, squared, 1.0)
-    nearest = offset + along.clamp(0, 1)[..., None] * axis
-    to_segment = nearest.norm(dim=2)
-    to_joint = offset.norm(dim=2)
-    facing = (offset * normals[:, None]).sum(2) / to_joint.clamp(min=1e-6)
-    scalars = [to_joint, to_segment, (to_segment + 0.02).log(), facing]
-    return torch.cat([offset, torch.stack(scalars, dim=2)], dim=2)
+    # Not by |p|^2 + |j|^2 - 2 p.j, which is far off where a vertex meets a joint.
+    exact = "donot_use_mm_for_euclid_dist"
+    to_joint = torch.cdist(positions, joints, compute_mode=exact)  # (N, J)
+    # The point of the bone's line nearest to the node, in bone lengths from the joint.
+    along = positions @ axis.T - (joints * axis).sum(1)
+    along = along / torch.where(squared > 0, squared, 1.0)
+    inside = along.clamp(0, 1)
+    to_segment = to_joint**2 + squared * inside * (inside - 2 * along)
+    to_segment = to_segment.clamp(min=1e-8).sqrt()
+    facing = normals @ joints.T - (positions * normals).sum(1, keepdim=True)
+    facing = facing / to_joint.clamp(min=1e-3)
+    return torch.stack([to_joint, to_segment, (to_segment + 0.02).log(), facing], dim=2)
 
 
 class CrossAttention(nn.Module):
@@ -65,8 +69,9 @@ class CrossAttention(nn.Module):
         self.key = nn.Linear(bone_width, mesh_width)
         if pair_width:
             self.pair = nn.Linear(PAIR_FEATURES, pair_width)
-            self.pair_vertex = nn.Linear(mesh_width, pair_width, bias=False)
-            self.pair_bone = nn.Linear(bone_width, pair_width, bias=False)
+            # A linear map of the way from node to joint is one of each of its ends.
+            self.pair_vertex = nn.Linear(mesh_width + 3, pair_width, bias=False)
+            self.pair_bone = nn.Linear(bone_width + 3, pair_width, bias=False)
             self.pair_out = nn.Sequential(
                 nn.ReLU(inplace=True),
                 nn.Linear(pair_width, pair_width),
@@ -106,6 +111,6 @@ class CrossAttention(nn.Module):
             return logits
         pair = self.pair(pair_features(positions, normals, skeleton))  # (N, J, P)
         # In place: each new (N, J, P) array costs more than the sum in it.
-        pair += self.pair_vertex(vertices)[:, None]
-        pair += self.pair_bone(bones)
+        pair += self.pair_vertex(torch.cat([vertices, positions], dim=1))[:, None]
+        pair += self.pair_bone(torch.cat([bones, skeleton.joints], dim=1))
         return logits + self.pair_out(pair).squeeze(2)

@@ -53,7 +53,13 @@ def gather_max(values: Tensor, neighbours: Tensor) -> Tensor:
     """
     if not 1 <= neighbours.shape[1] <= 256:
         raise ValueError(f"{neighbours.shape[1]} neighbours a node: use 1 to 256")
-    return _GatherMax.apply(values, neighbours)
+    if torch.is_grad_enabled() and values.requires_grad:
+        return _GatherMax.apply(values, neighbours)
+    columns = neighbours.t().contiguous()
+    best = values.index_select(0, columns[0])
+    for column in columns[1:]:
+        best = torch.maximum(best, values.index_select(0, column))
+    return best
 
 
 class EdgeConv(nn.Module):
