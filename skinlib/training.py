@@ -242,7 +242,8 @@ class Trainer:
             torch.set_num_threads(1)
         rng = np.random.default_rng([self.config.seed, 1, draw])
         head, graph = self._draw(draw, rng)
-        head = augment(head, rng, self.config.augment)
+        others = self.labelled + self.unlabelled
+        head = augment(head, rng, self.config.augment, others)
         if not self.config.augment.keeps_mesh:
             graph = build_graph(head, self.model.config.graph)
         mesh, skeleton = mesh_input(head, graph), skeleton_input(head)

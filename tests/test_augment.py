@@ -20,6 +20,7 @@ from skinlib.datasets.augment import (
     pose,
     reorder_bones,
     reorder_vertices,
+    resemble,
     scale,
     stretch,
     warp,
@@ -129,10 +130,10 @@ def test_an_unlabelled_head_cannot_be_posed(head):
 @pytest.mark.parametrize("config", [AugmentConfig(), ALL, OFF])
 @pytest.mark.parametrize("seed", range(6))
 def test_augment_is_valid_and_decided_by_the_seed(config, seed):
-    head = synthetic_head(seed, 700)
-    one = augment(head, np.random.default_rng(seed), config)
+    head, others = synthetic_head(seed, 700), [synthetic_head(seed + 6, 700)]
+    one = augment(head, np.random.default_rng(seed), config, others)
     assert_valid(one)
-    assert_same(one, augment(head, np.random.default_rng(seed), config))
+    assert_same(one, augment(head, np.random.default_rng(seed), config, others))
     # One pass over the normals has to be as good as one after every step.
     if config.keeps_mesh:
         fresh = vertex_normals(one.vertices, one.faces)
@@ -141,6 +142,37 @@ def test_augment_is_valid_and_decided_by_the_seed(config, seed):
             np.sort(one.faces, axis=1), np.sort(head.faces, axis=1)
         )
     assert augment(head.replace(weights=None), np.random.default_rng(0)).weights is None
+
+
+def test_resemble_takes_over_the_proportions_of_another_head(head):
+    other = synthetic_head(8, 700, bones=12, unit="m", up="y")
+    assert set(other.skeleton.names) == set(head.skeleton.names)
+    order = [other.skeleton.names.index(name) for name in head.skeleton.names]
+
+    def shape(joints):
+        joints = joints.astype(float) - joints.mean(axis=0)
+        return joints / joints.std()
+
+    goal = shape(other.skeleton.joints[order])
+    gaps = [
+        np.abs(shape(resemble(head, other, amount).skeleton.joints) - goal).mean()
+        for amount in (0, 0.5, 1)
+    ]
+    assert gaps[0] > 2 * gaps[2] and gaps[0] > gaps[1] > gaps[2]
+    changed = resemble(head, other)
+    assert_valid(changed)
+    np.testing.assert_array_equal(changed.weights, head.weights)
+    assert 0.7 < box(changed) / box(head) < 1.4  # still in its own unit
+    assert_same(resemble(head, head), head, atol=1e-4)
+
+
+def test_resemble_leaves_a_head_alone_that_shares_no_names(head):
+    names = tuple(f"bone {i}" for i in range(len(head.skeleton)))
+    stranger = head.replace(
+        skeleton=dataclasses.replace(head.skeleton, names=names),
+        vertices=head.vertices * 2,
+    )
+    assert resemble(head, stranger) is head
 
 
 def test_augment_with_everything_off_changes_nothing(head):

@@ -222,7 +222,8 @@ def test_the_input_of_a_sphere_by_hand():
     np.testing.assert_allclose(mesh.curvature, np.tanh(0.1), atol=0.01)
     assert mesh.areas.mean() == pytest.approx(1)
     assert mesh.deviation.min() >= 0 and mesh.deviation.max() < 0.1
-    assert mesh_features(mesh).shape == (162, 8)
+    assert mesh.valence.sum() == -12  # an icosphere: twelve nodes with 5 edges
+    assert mesh_features(mesh).shape == (162, 10)
     expected = np.linalg.norm(head.skeleton.joints - [10, 0, 0], axis=1) / 5
     np.testing.assert_allclose(bones.joints.norm(dim=1), expected, rtol=0.05)
     assert (bones.depths == torch.from_numpy(head.skeleton.depths)).all()

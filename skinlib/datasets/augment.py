@@ -4,8 +4,9 @@ Each function takes a head and a generator and returns a new head; weights may b
 where nothing is said. What becomes of the mesh decides whether a graph built for the
 head still fits:
 
-- vertices and triangles stay: `scale`, `stretch`, `rotate`, `warp`, `jitter`, `pose`,
-  `collapse_bones`, `reorder_bones`; `mirror` only turns the triangles around.
+- vertices and triangles stay: `scale`, `stretch`, `rotate`, `warp`, `resemble`,
+  `jitter`, `pose`, `collapse_bones`, `reorder_bones`; `mirror` only turns the
+  triangles around.
 - other triangles between the same vertices: `flip_edges`.
 - other vertices: `cut_seams`, `drop_islands`, `reorder_vertices`.
 
@@ -14,9 +15,11 @@ places, so a graph may be built once per head.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import RBFInterpolator
 from scipy.spatial.transform import Rotation
 
 from skinlib.datasets import synthetic
@@ -28,6 +31,7 @@ from skinlib.skinning import (
     mirror_pairs,
 )
 
+MIN_SHARED_BONES = 8
 _NOT_YET = np.zeros((0, 3), np.float32)  # normals that a later step computes
 
 
@@ -40,6 +44,7 @@ class AugmentConfig:
     mirror: float = 0.5  # chance to swap left and right
     pose: float = 0.5  # chance to be posed; unlabelled heads never are
     pose_degrees: float = 4.0  # standard deviation of a posed bone's turn
+    resemble: float = 0.5  # chance to take over proportions of another training head
     warp: float = 0.8  # largest gradient of a smooth warp, below 1; drawn from 0 up
     stretch: float = 0.1  # standard deviation of the log of each axis' scale
     rotate: float = 5.0  # standard deviation of the turn of the whole head, degrees
@@ -61,9 +66,15 @@ class AugmentConfig:
 
 
 def augment(
-    head: Head, rng: np.random.Generator, config: AugmentConfig | None = None
+    head: Head,
+    rng: np.random.Generator,
+    config: AugmentConfig | None = None,
+    others: Sequence[Head] = (),
 ) -> Head:
     """A random variation of a head; the same state of `rng` gives the same one.
+
+    Args:
+        others: heads whose proportions it may take over, see `resemble`.
 
     >>> head = synthetic.synthetic_head(0, vertices=700)
     >>> other = augment(head, np.random.default_rng(0))
@@ -81,6 +92,9 @@ def augment(
     before, head = head, _with(head, normals=_NOT_YET)
     if rng.random() < config.pose and head.weights is not None:
         head = pose(head, rng, config.pose_degrees)
+    if others and rng.random() < config.resemble:
+        other = others[int(rng.integers(len(others)))]
+        head = resemble(head, other, rng.random())
     if config.warp:
         head = warp(head, rng, config.warp * rng.random())
     if config.stretch:
@@ -172,6 +186,44 @@ class Warp:
 def warp(head: Head, rng: np.random.Generator, strength: float = 0.3) -> Head:
     """Another face: a random `Warp` of vertices, joints and tails alike."""
     return _move_space(head, Warp(rng, _centre(head), _diagonal(head), strength))
+
+
+def resemble(head: Head, other: Head, amount: float = 1.0) -> Head:
+    """Another head's proportions on this mesh: joints move towards the other's.
+
+    Bones are matched by name. The way of each joint, in a common centre and size, is
+    spread over space by the smoothest linear radial basis function; a head with fewer
+    than `MIN_SHARED_BONES` names in common stays as it is.
+
+    Args:
+        amount: 0 .. 1, part of the way.
+    """
+    place = {name: bone for bone, name in enumerate(other.skeleton.names)}
+    pairs = [
+        (bone, place[name])
+        for bone, name in enumerate(head.skeleton.names)
+        if name in place
+    ]
+    if len(pairs) < MIN_SHARED_BONES:
+        return head
+    mine, theirs = np.array(pairs).T
+    mine = head.skeleton.joints[mine].astype(np.float64)
+    theirs = other.skeleton.joints[theirs].astype(np.float64)
+    centre, size = mine.mean(axis=0), mine.std()
+    if not (size > 0 and theirs.std() > 0):
+        return head
+    mine = (mine - centre) / size
+    theirs = (theirs - theirs.mean(axis=0)) / theirs.std()
+    # Joints in one place would pull it in two directions.
+    _, first = np.unique(mine.round(3), axis=0, return_index=True)
+    way = RBFInterpolator(
+        mine[first], (theirs - mine)[first], kernel="linear", degree=0, smoothing=0.01
+    )
+
+    def move(points):
+        return points + amount * size * way((points - centre) / size)
+
+    return _move_space(head, move)
 
 
 def jitter(

@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from skinlib.geometry import Frame, canonical_frame, curvature, normal_deviation
-from skinlib.graph import GraphConfig, build_graph, node_areas, node_normals
+from skinlib.graph import MESH, GraphConfig, build_graph, node_areas, node_normals
 from skinlib.head import Head
 
 # Curvature is 1 / radius; a lid or a lip bends about 10 times as much as the skull.
@@ -20,7 +20,7 @@ CURVATURE_UNIT = 10.0
 # In head radii: nothing that belongs to a head is further away. What is (a vertex left
 # behind, a bone in another unit) would overflow once squared.
 FAR = 1e3
-CACHE_VERSION = "2"
+CACHE_VERSION = "3"
 MIN_FRAME_BONES = 5
 
 
@@ -43,10 +43,22 @@ class MeshInput(_Tensors):
     curvature: Tensor  # (N,), squashed to -1 .. 1
     deviation: Tensor  # (N,), 0 .. 2
     areas: Tensor  # (N,), share of the surface, mean 1
+    valence: Tensor  # (N,), mesh edges a node has, less the 6 of a regular mesh
     neighbours: Tensor  # (N, K) int64
-    used: Tensor  # (N, K) bool, False where `neighbours` only fills the table
+    kinds: Tensor  # (N, K) int8, MESH or SPACE; -1 where `neighbours` is only filled up
     island: Tensor  # (N,) int64
     node_of_vertex: Tensor  # (V,) int64
+
+    @property
+    def used(self) -> Tensor:
+        """(N, K) bool: which neighbours are more than a filling of the table."""
+        return self.kinds >= 0
+
+    @property
+    def mesh_neighbours(self) -> Tensor:
+        """(N, K) int64: `neighbours`, with those in space replaced by the first one."""
+        first = self.neighbours[:, :1]
+        return torch.where(self.kinds == MESH, self.neighbours, first)
 
 
 @dataclass(frozen=True)
@@ -150,8 +162,9 @@ def mesh_input(head: Head, graph) -> MeshInput:
         _float(np.tanh(bend)),
         _float(normal_deviation(normals, graph.edges)),
         _float(areas),
+        _float(np.bincount(graph.edges.ravel(), minlength=len(graph)) - 6),
         torch.from_numpy(graph.neighbours),
-        torch.from_numpy(graph.kinds >= 0),
+        torch.from_numpy(graph.kinds),
         torch.from_numpy(graph.island),
         torch.from_numpy(graph.node_of_vertex),
     )

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from skinlib.graph import MESH
 from skinlib.model.inputs import MeshInput
 from skinlib.model.layers import (
     EdgeConv,
@@ -11,14 +12,24 @@ from skinlib.model.layers import (
     island_mean,
 )
 
-# Position, normal, curvature, normal deviation.
-MESH_FEATURES = 3 + 3 + 1 + 1
+# Position, normal, curvature, normal deviation, log of the area, valence.
+MESH_FEATURES = 3 + 3 + 1 + 1 + 1 + 1
 
 
 def mesh_features(mesh: MeshInput) -> Tensor:
-    """(N, 8): position, normal, curvature and normal deviation of each node."""
-    bend = torch.stack([mesh.curvature, mesh.deviation], dim=1)
-    return torch.cat([mesh.positions, mesh.normals, bend], dim=1)
+    """(N, 10): what is known of each node by itself.
+
+    Position, normal, curvature and normal deviation; how finely and how regularly the
+    artist meshed the place: the logarithm of the node's area, and its valence.
+    """
+    scalars = [
+        mesh.curvature,
+        mesh.deviation,
+        mesh.areas.clamp(min=1e-3).log(),
+        mesh.valence.clamp(-4, 8) / 2,
+    ]
+    scalars = torch.stack(scalars, dim=1)
+    return torch.cat([mesh.positions, mesh.normals, scalars], dim=1)
 
 
 class MeshEncoder(nn.Module):
@@ -62,12 +73,16 @@ class MeshEncoder(nn.Module):
 
     def forward(self, mesh: MeshInput) -> Tensor:
         """N nodes -> (N, C)."""
-        extra = (mesh.used,) if self.convolution == "gat" else ()
+        # The first layer of a block hears the surface alone, the second one space too.
+        heard = (
+            (mesh.mesh_neighbours, mesh.kinds == MESH),
+            (mesh.neighbours, mesh.used),
+        )
         x = self.embed(mesh_features(mesh))
         for i, (pool, wide) in enumerate(zip(self.pooled, self.wide, strict=True)):
-            for layer in (2 * i, 2 * i + 1):
-                normal = self.norms[layer](x)
-                x = x + self.local[layer](normal, mesh.neighbours, *extra)
+            for layer, table in enumerate(heard, start=2 * i):
+                table = table if self.convolution == "gat" else table[:1]
+                x = x + self.local[layer](self.norms[layer](x), *table)
             x = x + pool(island_mean(x, mesh.island, mesh.areas))
             x = wide(x, mesh.areas)
         return self.norm(x)
