@@ -1,6 +1,7 @@
 """Train on a folder of heads and judge on topology groups that were held out.
 
     python benchmarks/rocketbox.py HEADS OUT --config.minutes 30 [--fold 0]
+    python benchmarks/rocketbox.py HEADS OUT --fold none --extra MORE  # judge nothing
 
 Heads are split into `FOLDS` folds by topology group; a group that holds more than a
 quarter of all heads is always trained on. Groups are joined at 0.47 shared topology,
@@ -42,20 +43,26 @@ class Run:
 
     heads: Positional[Path]  # folder of skinned heads
     out: Positional[Path]  # folder for the model and the scores
-    fold: Literal[0, 1, 2, 3] = 0  # which of the folds is held out
+    fold: Literal["0", "1", "2", "3", "none"] = "0"  # which of the folds is held out
     extra: Path | None = None  # folder of more heads, only to train on
     config: TrainConfig = field(default_factory=TrainConfig)  # every setting
 
 
 def main(run: Run) -> None:
     """Split, train, judge, write."""
-    labelled, held_out = split(load_folder(run.heads), run.fold)
+    heads = load_folder(run.heads)
+    labelled, held_out = (
+        (heads, []) if run.fold == "none" else split(heads, int(run.fold))
+    )
     # A remeshed copy is called NAME__HOW; a copy of a held-out head is held out too.
-    hidden = {head.name for head in held_out}
+    known, hidden = ({head.name for head in some} for some in (heads, held_out))
     extra = load_folder(run.extra) if run.extra else []
+    extra = [head for head in extra if head.name not in known]
     extra = [head for head in extra if head.name.split("__")[0] not in hidden]
     # No held-out head chooses the step that is kept: it is the last one.
     model = train(run.config, labelled + extra, run.out / "model", validation=[])
+    if not held_out:
+        return
     result = evaluate(held_out, train_heads=labelled, model=model)
     result["held_out"] = [head.name for head in held_out]
     (run.out / "scores.json").write_text(json.dumps(result, indent=1))
