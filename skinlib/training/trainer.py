@@ -9,65 +9,39 @@ was not, and the number of threads changes the time, not the result.
 import contextlib
 import copy
 import json
-import os
 import signal
 import threading
 import time
 import zlib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from skinlib.datasets.augment import AugmentConfig, augment
+from skinlib.datasets.augment import augment
 from skinlib.evaluate.groups import group_split
 from skinlib.evaluate.metrics import row_l1
-from skinlib.graph import GraphConfig, HybridGraph, build_graph
+from skinlib.graph import HybridGraph, build_graph
 from skinlib.head import Head, HeadError
-from skinlib.losses import LossWeights, supervised
-from skinlib.model import ModelConfig, SkinningModel
+from skinlib.losses import supervised
+from skinlib.model import SkinningModel
 from skinlib.model.inputs import content_hash, mesh_input, skeleton_input
-from skinlib.paths import checkpoint
+from skinlib.training.checkpoint import (
+    STATE,
+    load_model,
+    read_tensors,
+    replace_file,
+    save_model,
+    write_tensors,
+)
+from skinlib.training.config import TrainConfig
 
-STATE = "training.safetensors"
-WEIGHTS = "model.safetensors"
-CONFIG = "config.json"
 HISTORY = "history.json"
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """What a training run is; the same configuration and heads give the same model."""
-
-    minutes: float = 30.0  # training time, unless `steps` is given
-    steps: int | None = None  # number of steps, for runs that repeat to the bit
-    batch: int = 2  # heads a step
-    judged_nodes: int = 1024  # nodes of a head whose weights enter the loss
-    optimizer: str = "muon"  # muon: for matrices, with AdamW for the rest; or adamw
-    learning_rate: float = 5e-3  # after the warm-up
-    weight_decay: float = 0.01  # pull of every parameter towards 0
-    warmup: int = 100  # steps over which the learning rate rises
-    cooldown: float = 0.5  # last part of the run, in which the learning rate falls to 0
-    clip: float = 1.0  # largest norm of a step's gradient
-    ema: float = 0.998  # decay of the averaged parameters that are kept
-    seed: int = 0  # of parameters, order and augmentation
-    threads: int = min(2, os.cpu_count() or 1)  # heads differentiated at once
-    device: str = "cpu"  # cpu, cuda, cuda:1, ...
-    validation_share: float = 0.08  # of the heads, when no validation heads are given
-    validations: int = 20  # how often the run is validated
-    save_seconds: float = 60.0  # how often the state to resume from is written
-    unlabelled_share: float = 0.25  # of the draws, when unlabelled heads are given
-    unlabelled_start: float = 0.3  # part of the run after which they are drawn
-    model: ModelConfig = field(default_factory=ModelConfig)
-    loss: LossWeights = field(default_factory=LossWeights)
-    augment: AugmentConfig = field(default_factory=AugmentConfig)
 
 
 def train(
@@ -351,11 +325,11 @@ class Trainer:
             "history": self.history,
         }
         tensors = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-        _write(self.out / STATE, tensors, {"progress": json.dumps(progress)})
-        _replace(self.out / HISTORY, json.dumps(self.history, indent=1).encode())
+        write_tensors(self.out / STATE, tensors, {"progress": json.dumps(progress)})
+        replace_file(self.out / HISTORY, json.dumps(self.history, indent=1).encode())
 
     def _resume(self) -> None:
-        tensors, metadata = _read(self.out / STATE)
+        tensors, metadata = read_tensors(self.out / STATE)
         try:
             self._restore(tensors, json.loads(metadata["progress"]))
         except HeadError:
@@ -432,61 +406,6 @@ class Trainer:
         return json.loads(json.dumps(settings | heads))
 
 
-def save_model(model: SkinningModel, folder: str | Path, extra: dict) -> None:
-    """Write `model.safetensors` and a readable `config.json` into a folder."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    tensors = {k: v.cpu().contiguous() for k, v in model.state_dict().items()}
-    config = json.dumps({"model": model.describe()} | extra, indent=1)
-    # The weights carry their own configuration, so the two files cannot disagree.
-    _write(folder / WEIGHTS, tensors, {"config": config})
-    _replace(folder / CONFIG, f"{config}\n".encode())
-
-
-def load_model(name: str | Path) -> SkinningModel:
-    """The model of a shipped checkpoint, or of a folder that `train` wrote.
-
-    Args:
-        name: a folder, a `model.safetensors` file, or a name in `checkpoints/`.
-
-    Raises:
-        HeadError: there is no such checkpoint, or the file is damaged.
-    """
-    folder = Path(name)
-    path = folder if folder.suffix == ".safetensors" else folder / WEIGHTS
-    # Somebody's folder of heads may have the name of a shipped checkpoint.
-    if not path.is_file() and not (folder / STATE).exists():
-        if str(name) == folder.name and folder != path:
-            path = checkpoint(folder.name) / WEIGHTS
-    if not path.is_file():
-        raise HeadError(
-            "checkpoint",
-            "there is no such file",
-            "give a folder that `skinlib train --out` wrote (a model is there from the "
-            "first validation on), or a shipped name",
-            path,
-        )
-    tensors, metadata = _read(path)
-    try:
-        settings = json.loads(metadata["config"])["model"]
-        config = ModelConfig(**(settings | {"graph": GraphConfig(**settings["graph"])}))
-        model = SkinningModel(config)
-        model.load_state_dict(tensors)
-    except (ArithmeticError, LookupError, TypeError, ValueError, RuntimeError) as error:
-        raise HeadError(
-            "checkpoint",
-            f"a file that is no skinlib model ({type(error).__name__})",
-            "use a model.safetensors that `skinlib train` wrote",
-            path,
-        ) from error
-    return model.eval()
-
-
-def finetune_config(config: TrainConfig, **changes) -> TrainConfig:
-    """A configuration for going on from a trained model: a tenth of the step size."""
-    return replace(config, learning_rate=config.learning_rate / 10, **changes)
-
-
 def _optimizers(model: SkinningModel, config: TrainConfig):
     """AdamW for all parameters, or Muon for matrices between features and AdamW.
 
@@ -549,39 +468,3 @@ def _uninterrupted() -> Iterator[None]:
             signal.signal(number, handler)
         for number in waiting:
             signal.raise_signal(number)
-
-
-def _write(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
-    # As bytes: `save_file` would make a file that nobody else may read.
-    _replace(path, save(tensors, metadata))
-
-
-def _replace(path: Path, content: bytes) -> None:
-    """Write a file that appears whole or not at all."""
-    partial = path.with_suffix(".partial")
-    try:
-        partial.write_bytes(content)
-        os.replace(partial, path)
-    except OSError as error:
-        raise HeadError(
-            "checkpoint",
-            f"it cannot be written ({error.strerror})",
-            "see to space and permissions, then run the same command again",
-            path,
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink()
-
-
-def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    try:
-        with safe_open(path, "pt") as file:
-            return {k: file.get_tensor(k) for k in file.keys()}, file.metadata() or {}
-    except (SafetensorError, OSError) as error:
-        raise HeadError(
-            "checkpoint",
-            f"it cannot be read ({error})",
-            "copy the file again, or delete it and train anew",
-            path,
-        ) from error
