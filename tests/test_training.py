@@ -261,7 +261,7 @@ def test_an_interrupt_inside_an_update_or_a_validation(
         if where == "predict":
             patch.setattr(trainer.average, where, pressing(trainer.average.predict))
         elif where == "save_model":
-            patch.setattr(training, where, pressing(save_model))
+            patch.setattr(training.trainer, where, pressing(save_model))
         else:  # between two optimizers
             last = trainer.optimizers[-1]
             patch.setattr(last, "step", pressing(last.step))
@@ -418,7 +418,9 @@ def test_the_best_model_is_kept_not_the_last(heads, tmp_path, monkeypatch):
     errors = iter([0.5, 0.3, 0.4, 0.9])
     config = replace(CONFIG_OF_TESTS, steps=4)
     trainer = Trainer(config, heads[:1], tmp_path, validation=heads[1:2])
-    monkeypatch.setattr("skinlib.training.row_l1", lambda *_: np.full(3, next(errors)))
+    monkeypatch.setattr(
+        "skinlib.training.trainer.row_l1", lambda *_: np.full(3, next(errors))
+    )
     kept = []
     for _ in range(4):
         trainer.step()
@@ -452,7 +454,9 @@ def test_a_checkpoint_that_is_not_there(name):
 def test_a_folder_named_like_a_shipped_checkpoint(finished, tmp_path, monkeypatch):
     shipped = tmp_path / "shipped"
     shutil.copytree(finished, shipped)
-    monkeypatch.setattr(training, "checkpoint", lambda name: tmp_path / "shipped")
+    monkeypatch.setattr(
+        training.checkpoint, "checkpoint", lambda name: tmp_path / "shipped"
+    )
     monkeypatch.chdir(tmp_path)
     (tmp_path / "heads").mkdir()
     assert load_model("heads").config == TINY
