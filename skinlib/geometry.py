@@ -10,6 +10,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+MAX_COTANGENT = 100.0  # of a face's sharpest angle; half a degree
+
 
 def safe_normalize(vectors: np.ndarray, fallback=(0.0, 0.0, 0.0)) -> np.ndarray:
     """Rows of unit length; a zero row becomes `fallback`.
@@ -71,6 +73,47 @@ def mesh_edges(faces: np.ndarray) -> np.ndarray:
     size = int(faces.max()) + 1
     key = np.unique(a[a != b] * size + b[a != b])
     return np.stack(np.divmod(key, size), axis=1)
+
+
+def cotangents(
+    vertices: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The edges of a mesh and how strongly the surface joins their ends.
+
+    c_ab = (cot alpha + cot beta) / 2, for the angles opposite the edge. Equation
+    `dirichlet`. Where two faces are obtuse it is negative; the energy never is.
+
+    Args:
+        vertices: (V, 3), any unit. faces: (F, 3), any orientation. A seam cuts the
+            surface; to close it, pass the nodes of a graph instead of the vertices.
+
+    Returns:
+        edges: (E, 2) int64, those of `mesh_edges`.
+        weights: (E,) float64, finite. A face of no area counts nothing, and one with an
+            angle below about half a degree less, so that no sliver outweighs a head.
+
+    >>> square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    >>> edges, weights = cotangents(square, np.array([[0, 1, 2], [0, 2, 3]]))
+    >>> edges.tolist(), weights.round(6).tolist()
+    ([[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]], [0.5, 0.0, 0.5, 0.5, 0.5])
+    """
+    edges = mesh_edges(faces)
+    if len(edges) == 0:
+        return edges, np.zeros(0)
+    import igl  # here, since it takes long to load
+
+    halves = igl.cotmatrix_entries(np.asarray(vertices, np.float64), faces)  # (F, 3)
+    largest = np.abs(halves).max(axis=1, keepdims=True)
+    # Each face as a whole: with one angle clipped its energy could fall below 0.
+    share = np.minimum(1, MAX_COTANGENT / 2 / np.maximum(largest, 1e-300))
+    halves = np.multiply(
+        halves, share, out=np.zeros_like(halves), where=np.isfinite(largest)
+    )
+    opposite = faces[:, [1, 2, 2, 0, 0, 1]].reshape(-1, 2)  # the order of `halves`
+    a, b = np.sort(opposite, axis=1).T
+    size = len(vertices)
+    summed = coo_matrix((halves.ravel(), (a, b)), shape=(size, size)).tocsr()
+    return edges, np.asarray(summed[edges[:, 0], edges[:, 1]]).reshape(-1)
 
 
 def weld(vertices: np.ndarray, tolerance: float = 1e-6) -> np.ndarray:

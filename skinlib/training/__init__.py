@@ -7,14 +7,23 @@ from skinlib.training.checkpoint import (
     load_model,
     save_model,
 )
-from skinlib.training.config import TrainConfig, finetune_config
+from skinlib.training.config import (
+    AS_WRITTEN,
+    SUPERVISED_ONLY,
+    TermForms,
+    TrainConfig,
+    finetune_config,
+)
 from skinlib.training.trainer import HISTORY, Trainer, train
 
 __all__ = [
+    "AS_WRITTEN",
     "CONFIG",
     "HISTORY",
     "STATE",
+    "SUPERVISED_ONLY",
     "WEIGHTS",
+    "TermForms",
     "TrainConfig",
     "Trainer",
     "finetune_config",

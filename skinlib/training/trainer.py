@@ -13,7 +13,7 @@ import signal
 import threading
 import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.optim import AdamW, Muon
 from tqdm.auto import tqdm
 
 from skinlib.datasets.augment import augment
@@ -28,9 +29,9 @@ from skinlib.evaluate.groups import group_split
 from skinlib.evaluate.metrics import row_l1
 from skinlib.graph import HybridGraph, build_graph
 from skinlib.head import Head, HeadError
-from skinlib.losses import supervised
-from skinlib.model import SkinningModel
+from skinlib.model import Critic, SkinningModel
 from skinlib.model.inputs import content_hash, mesh_input, skeleton_input
+from skinlib.training import parallel
 from skinlib.training.checkpoint import (
     STATE,
     load_model,
@@ -40,6 +41,7 @@ from skinlib.training.checkpoint import (
     write_tensors,
 )
 from skinlib.training.config import TrainConfig
+from skinlib.training.terms import D_S, D_U, Sample, Terms
 
 HISTORY = "history.json"
 
@@ -69,7 +71,8 @@ def train(
         HeadError: a head without weights, or `out` holds another run.
         KeyboardInterrupt: passed on, after the state has been written.
     """
-    return Trainer(config, labelled, out, unlabelled, validation, start).run()
+    with parallel.processes(config) as config:
+        return Trainer(config, labelled, out, unlabelled, validation, start).run()
 
 
 class Trainer:
@@ -104,15 +107,27 @@ class Trainer:
             self.model.load_state_dict(start.state_dict())
         self.model.to(config.device)
         self.average = copy.deepcopy(self.model).requires_grad_(False)
-        self.parameters = list(self.model.parameters())
+        self.critics = {
+            name: Critic(config.critic).to(config.device)
+            for name in (D_S, D_U)
+            if getattr(config.terms, name) and (name == D_S or self.unlabelled)
+        }
+        self.terms = Terms(config, self.model, self.critics)
+        self.networks = {"model": self.model} | self.critics
+        self.parameters = [
+            parameter
+            for network in self.networks.values()
+            for parameter in network.parameters()
+        ]
         self.optimizers = _optimizers(self.model, config)
+        self.critic_optimizers = _critic_optimizers(self.critics, config)
         # What a resumed run needs beside the tensors.
         self.steps_done, self.seconds = 0, 0.0
         self.cooldown_start: int | None = None
         if config.steps is not None:
             self.cooldown_start = int(config.steps * (1 - config.cooldown))
         self.best = float("inf")
-        self.recent: float | None = None  # running mean of the training row-L1
+        self.recent: dict[str, float] = {}  # running means of row-L1 and of the terms
         self.history: list[dict] = []
         self._pool = None
         if (self.out / STATE).exists():
@@ -132,9 +147,10 @@ class Trainer:
                     if self._validation_due():
                         self.validate()
                     began = time.monotonic()
-                    error = self.step()
+                    self.step()
                     self.seconds += time.monotonic() - began
-                    self._show(bar, error)
+                    self.seconds = parallel.from_first(self.seconds)
+                    self._show(bar)
                     if time.monotonic() - saved > self.config.save_seconds:
                         self.save()
                         saved = time.monotonic()
@@ -147,6 +163,7 @@ class Trainer:
         if not self.history or self.history[-1]["step"] != self.steps_done:
             self.validate()
         self.save()
+        parallel.wait()  # for the process that writes
         return load_model(self.out).to(self.config.device)
 
     @property
@@ -174,75 +191,109 @@ class Trainer:
             rate *= (self.last_step - self.steps_done) / length
         return rate
 
-    def step(self) -> float:
-        """One step over `batch` heads; returns their mean row-L1."""
+    def step(self) -> dict[str, float]:
+        """One step over `batch` heads; returns row-L1 and the terms, means over them.
+
+        The dictionary is empty when the budget turns out to be spent.
+        """
         budget = self.config.minutes * 60 * (1 - self.config.cooldown)
         if self.cooldown_start is None and self.seconds >= budget:
             self.cooldown_start = max(1, self.steps_done)
             if self.finished:
-                return float("nan")
+                return {}
         first = self.steps_done * self.config.batch
         draws = range(first, first + self.config.batch)
-        mapped = (self._pool.map if self._pool else map)(self._gradient, draws)
-        gradients, errors = zip(*mapped, strict=True)
+        mine = parallel.share_draws(draws)
+        mapped = (self._pool.map if self._pool else map)(self._gradient, mine)
+        every = parallel.gather_draws(list(mapped), len(draws), self.parameters)
+        gradients, shown = zip(*every, strict=True)
         for parameter, *parts in zip(self.parameters, *gradients, strict=True):
             parameter.grad = sum(parts) / len(parts)
-        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.config.clip)
-        if not torch.isfinite(norm):
-            raise FloatingPointError(
-                f"the gradient of step {self.steps_done} is not finite: "
-                f"lower learning_rate ({self.config.learning_rate})"
-            )
+        for name, network in self.networks.items():
+            norm = nn.utils.clip_grad_norm_(network.parameters(), self.config.clip)
+            if not torch.isfinite(norm):
+                raise FloatingPointError(
+                    f"the gradient of step {self.steps_done} ({name}) is not finite: "
+                    f"lower learning_rate ({self.config.learning_rate})"
+                )
+        means = _means(shown)
         with _uninterrupted():
             self._update()
-        return float(np.mean(errors))
+            for name, value in means.items():
+                before = self.recent.get(name, value)
+                self.recent[name] = 0.98 * before + 0.02 * value
+        return means
+
+    @property
+    def generator_due(self) -> bool:
+        """Whether the generator moves in the next step; the critics always do."""
+        return not self.critics or (self.steps_done + 1) % self.config.critic_steps == 0
+
+    @property
+    def mixed(self) -> bool:
+        """Whether unlabelled heads are drawn, too: after a first part of the run."""
+        started = self._progress_share() >= self.config.unlabelled_start
+        return bool(self.unlabelled) and started
 
     def _update(self) -> None:
         """Follow the gradients; the averaged parameters follow slowly."""
-        for optimizer in self.optimizers:
+        moving = self.optimizers if self.generator_due else []
+        for optimizer in [*moving, *self.critic_optimizers]:
             for group in optimizer.param_groups:
-                group["lr"] = self.learning_rate
+                group["lr"] = self.learning_rate * group["ratio"]
             optimizer.step()
         self.steps_done += 1
+        if not moving:
+            return
         decay = min(self.config.ema, self.steps_done / (self.steps_done + 10))
         with torch.no_grad():
-            pairs = zip(self.average.parameters(), self.parameters, strict=True)
+            pairs = zip(self.average.parameters(), self.model.parameters(), strict=True)
             for slow, fast in pairs:
                 slow.lerp_(fast, 1 - decay)
 
-    def _gradient(self, draw: int) -> tuple[tuple[Tensor, ...], float]:
-        """Gradient and row-L1 of one disturbed head; `draw` decides which and how."""
+    def _gradient(self, draw: int) -> tuple[list[Tensor], dict[str, float]]:
+        """Gradients, and numbers to show, of one head; `draw` decides which and how."""
         if self.config.device == "cpu":
             torch.set_num_threads(1)
         rng = np.random.default_rng([self.config.seed, 1, draw])
-        head, graph = self._draw(draw, rng)
+        head, graph, labelled = self._draw(draw, rng)
         others = self.labelled + self.unlabelled
         head = augment(head, rng, self.config.augment, others)
         if not self.config.augment.keeps_mesh:
             graph = build_graph(head, self.model.config.graph)
-        mesh, skeleton = mesh_input(head, graph), skeleton_input(head)
-        judged = min(len(graph), self.config.judged_nodes)
-        nodes = torch.from_numpy(rng.choice(len(graph), judged, replace=False))
-        target = torch.from_numpy(head.weights[graph.vertex_of_node])[nodes]
-        device = self.config.device
-        mesh, skeleton = mesh.to(device), skeleton.to(device)
-        logits = self.model.node_logits(mesh, skeleton, nodes.to(device))
-        loss = supervised(logits, target.to(device), self.config.loss)
-        error = (logits.detach().softmax(1).cpu() - target).abs().sum(1).mean()
-        return torch.autograd.grad(loss, self.parameters), error.item()
+        sample = Sample(head, graph, labelled, self.mixed, mix=float(rng.random()))
+        losses = self.terms.losses(sample, rng)
+        gradients = []
+        for name, network in self.networks.items():
+            loss = losses.generator if name == "model" else losses.critics
+            due = name != "model" or self.generator_due
+            if loss is not None and loss.requires_grad and due:
+                gradients += torch.autograd.grad(
+                    loss,
+                    list(network.parameters()),
+                    retain_graph=name != "model",
+                    materialize_grads=True,
+                )
+            else:
+                gradients += [torch.zeros_like(p) for p in network.parameters()]
+        return gradients, losses.shown
 
-    def _draw(self, draw: int, rng: np.random.Generator) -> tuple[Head, HybridGraph]:
-        """The head of a draw: labelled, in shuffled epochs, or unlabelled, guessed."""
-        if self.unlabelled and self._progress_share() > self.config.unlabelled_start:
-            if rng.random() < self.config.unlabelled_share:
-                place = int(rng.integers(len(self.unlabelled)))
-                head = self.unlabelled[place]
-                graph = self._graph(len(self.labelled) + place, head)
-                return head.replace(weights=self._guess(head, graph)), graph
+    def _draw(
+        self, draw: int, rng: np.random.Generator
+    ) -> tuple[Head, HybridGraph, bool]:
+        """Head, graph, and is it labelled; unlabelled ones come with guessed weights.
+
+        Labelled heads come in shuffled epochs.
+        """
+        if self.mixed and rng.random() < self.config.unlabelled_share:
+            place = int(rng.integers(len(self.unlabelled)))
+            head = self.unlabelled[place]
+            graph = self._graph(len(self.labelled) + place, head)
+            return head.replace(weights=self._guess(head, graph)), graph, False
         epoch, place = divmod(draw, len(self.labelled))
         shuffle = np.random.default_rng([self.config.seed, 2, epoch])
         place = int(shuffle.permutation(len(self.labelled))[place])
-        return self.labelled[place], self._graph(place, self.labelled[place])
+        return self.labelled[place], self._graph(place, self.labelled[place]), True
 
     @torch.no_grad()
     def _guess(self, head: Head, graph: HybridGraph) -> np.ndarray:
@@ -264,17 +315,19 @@ class Trainer:
         return self.seconds / max(1e-9, self.config.minutes * 60)
 
     def _progress(self):
-        if self.config.steps is not None:
-            return tqdm(total=self.config.steps, initial=self.steps_done, unit="step")
-        total, initial = round(self.config.minutes * 60), round(self.seconds)
-        return tqdm(total=total, initial=min(initial, total), unit="s")
+        total, done, unit = self.config.steps, self.steps_done, "step"
+        if total is None:
+            total, done = round(self.config.minutes * 60), round(self.seconds)
+            done, unit = min(done, total), "s"
+        hidden = not parallel.is_first()
+        return tqdm(total=total, initial=done, unit=unit, disable=hidden)
 
-    def _show(self, bar, error: float) -> None:
-        before = error if self.recent is None else self.recent
-        self.recent = 0.98 * before + 0.02 * error
+    def _show(self, bar) -> None:
         done = self.steps_done if self.config.steps is not None else int(self.seconds)
         bar.update(max(0, min(done, bar.total) - bar.n))
-        numbers = {"step": self.steps_done, "row_l1": f"{self.recent:.4f}"}
+        numbers = {"step": self.steps_done}
+        if "row_l1" in self.recent:
+            numbers["row_l1"] = f"{self.recent['row_l1']:.4f}"
         if np.isfinite(self.best):
             numbers["validation"] = f"{self.best:.4f}"
         bar.set_postfix(numbers, refresh=False)
@@ -295,23 +348,31 @@ class Trainer:
         # In this order: whoever is stopped in between validates once more.
         if error < self.best or not errors:
             trained = asdict(self.config) | {"model": self.average.describe()}
-            save_model(self.average, self.out, {"training": trained})
+            if parallel.is_first():
+                save_model(self.average, self.out, {"training": trained})
             self.best = error
+        recent = {name: round(value, 5) for name, value in self.recent.items()}
         self.history.append(
             {
                 "step": self.steps_done,
                 "minutes": round(self.seconds / 60, 3),
-                "train_row_l1": self.recent and round(self.recent, 5),
+                "train_row_l1": recent.pop("row_l1", None),
                 "validation_row_l1": round(error, 5) if errors else None,
+                "terms": recent,
             }
         )
         return error
 
     def save(self) -> None:
         """Write the state to resume from; a crash meanwhile leaves the older one."""
+        if not parallel.is_first():
+            return
         self.out.mkdir(parents=True, exist_ok=True)
-        tensors = {f"model.{k}": v for k, v in self.model.state_dict().items()}
-        tensors |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
+        tensors = {
+            f"{name}.{key}": value
+            for name, network in {"average": self.average, **self.networks}.items()
+            for key, value in network.state_dict().items()
+        }
         for i, parameter in enumerate(self.parameters):
             for key, value in self._moments(parameter).items():
                 tensors[f"optimizer.{i}.{key}"] = value
@@ -365,8 +426,8 @@ class Trainer:
                 if key.startswith(prefix)
             }
 
-        self.model.load_state_dict(part("model"))
-        self.average.load_state_dict(part("average"))
+        for name, network in {"average": self.average, **self.networks}.items():
+            network.load_state_dict(part(name))
         for i, parameter in enumerate(self.parameters):
             state = part(f"optimizer.{i}")
             if state:
@@ -381,7 +442,7 @@ class Trainer:
 
     def _moments(self, parameter: Tensor) -> dict[str, Tensor]:
         """What the optimizer in charge of a parameter remembers of it."""
-        for optimizer in self.optimizers:
+        for optimizer in [*self.optimizers, *self.critic_optimizers]:
             if any(parameter is p for g in optimizer.param_groups for p in g["params"]):
                 return optimizer.state[parameter]
         raise AssertionError("every parameter has an optimizer")
@@ -421,13 +482,38 @@ def _optimizers(model: SkinningModel, config: TrainConfig):
         if isinstance(module, nn.Linear) and min(module.weight.shape) > 12
     ]
     if config.optimizer == "adamw" or not matrices:
-        return [torch.optim.AdamW(model.parameters(), betas=(0.9, 0.98), **shared)]
+        return [_with_ratio(AdamW(model.parameters(), betas=(0.9, 0.98), **shared))]
     chosen = {id(matrix) for matrix in matrices}
     rest = [p for p in model.parameters() if id(p) not in chosen]
     return [
-        torch.optim.Muon(matrices, adjust_lr_fn="match_rms_adamw", **shared),
-        torch.optim.AdamW(rest, betas=(0.9, 0.98), **shared),
+        _with_ratio(Muon(matrices, adjust_lr_fn="match_rms_adamw", **shared)),
+        _with_ratio(AdamW(rest, betas=(0.9, 0.98), **shared)),
     ]
+
+
+def _critic_optimizers(critics: Mapping[str, Critic], config: TrainConfig) -> list:
+    """One AdamW a critic, without momentum, which a moving goal only misleads."""
+    ratio = config.critic_learning_rate / config.learning_rate
+    return [
+        _with_ratio(AdamW(critic.parameters(), lr=1.0, betas=(0.0, 0.9)), ratio)
+        for critic in critics.values()
+    ]
+
+
+def _with_ratio(optimizer: torch.optim.Optimizer, ratio: float = 1.0):
+    """The optimizer, which is to step at `ratio` times the schedule's rate."""
+    for group in optimizer.param_groups:
+        group["ratio"] = ratio
+    return optimizer
+
+
+def _means(shown: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Mean of each number over the heads that have it."""
+    names = dict.fromkeys(name for numbers in shown for name in numbers)
+    return {
+        name: float(np.mean([part[name] for part in shown if name in part]))
+        for name in names
+    }
 
 
 def _checksum(weights: np.ndarray | None) -> int:
