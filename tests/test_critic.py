@@ -224,10 +224,7 @@ def test_first_and_second_derivative_by_the_weights(in_float64):
 def test_derivative_of_the_penalty_by_the_parameters(in_float64):
     critic, mesh, bones, real = in_float64
     fake = rows(12).double()
-    names, values = zip(
-        *((k, v) for k, v in critic.named_parameters() if "score" in k or "surf" in k),
-        strict=True,
-    )
+    names, values = zip(*critic.surface.named_parameters(prefix="surface"), strict=True)
 
     def penalty(*values):
         def judge(weights):

@@ -332,8 +332,16 @@ def test_minutes_end_about_in_time(heads, tmp_path):
     seconds = time.monotonic() - began
     assert trainer.seconds == pytest.approx(1.5, rel=0.6)
     assert seconds < 8
-    assert trainer.last_step == trainer.steps_done
-    assert trainer.steps_done == pytest.approx(2 * trainer.cooldown_start, abs=1)
+    assert trainer.finished and trainer.learning_rate == 0
+
+
+def test_the_cooldown_keeps_to_the_time_when_steps_get_slower(heads, tmp_path):
+    config = replace(CONFIG_OF_TESTS, steps=None, minutes=1, cooldown=0.5, warmup=1)
+    trainer = Trainer(config, heads[:1], tmp_path, validation=[])
+    rates = {}
+    for trainer.seconds in (0.0, 29.0, 45.0, 59.0, 60.0):
+        rates[trainer.seconds] = trainer.learning_rate / config.learning_rate
+    assert rates == pytest.approx({0: 1, 29: 1, 45: 0.5, 59: 1 / 30, 60: 0})
 
 
 # ---------------------------------------------------------------- another run

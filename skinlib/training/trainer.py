@@ -123,9 +123,6 @@ class Trainer:
         self.critic_optimizers = _critic_optimizers(self.critics, config)
         # What a resumed run needs beside the tensors.
         self.steps_done, self.seconds = 0, 0.0
-        self.cooldown_start: int | None = None
-        if config.steps is not None:
-            self.cooldown_start = int(config.steps * (1 - config.cooldown))
         self.best = float("inf")
         self.recent: dict[str, float] = {}  # running means of row-L1 and of the terms
         self.history: list[dict] = []
@@ -139,7 +136,7 @@ class Trainer:
         """Train to the end of the budget and return the best model."""
         self.out.mkdir(parents=True, exist_ok=True)
         saved = time.monotonic()
-        with self._progress() as bar, ThreadPoolExecutor(self.config.threads) as pool:
+        with self._bar() as bar, ThreadPoolExecutor(self.config.threads) as pool:
             self._pool = pool
             try:
                 while not self.finished:
@@ -167,40 +164,26 @@ class Trainer:
         return load_model(self.out).to(self.config.device)
 
     @property
-    def last_step(self) -> int | None:
-        """The step at which the run ends, once it is known."""
+    def progress(self) -> float:
+        """0 .. 1, the part of the budget, steps or time, that is spent."""
         if self.config.steps is not None:
-            return self.config.steps
-        if self.cooldown_start is None:
-            return None
-        share = self.config.cooldown
-        return max(1, round(self.cooldown_start / max(1 - share, 1e-6)))
+            return min(1.0, self.steps_done / max(1, self.config.steps))
+        return min(1.0, self.seconds / max(1e-9, self.config.minutes * 60))
 
     @property
     def finished(self) -> bool:
         """Whether the budget is spent."""
-        return self.last_step is not None and self.steps_done >= self.last_step
+        return self.progress >= 1
 
     @property
     def learning_rate(self) -> float:
         """The learning rate of the next step: warm-up, constant, linear cool-down."""
         rate = self.config.learning_rate
         rate *= min(1.0, (self.steps_done + 1) / max(1, self.config.warmup))
-        if self.cooldown_start is not None and self.steps_done >= self.cooldown_start:
-            length = max(1, self.last_step - self.cooldown_start)
-            rate *= (self.last_step - self.steps_done) / length
-        return rate
+        return rate * min(1.0, (1 - self.progress) / max(1e-9, self.config.cooldown))
 
     def step(self) -> dict[str, float]:
-        """One step over `batch` heads; returns row-L1 and the terms, means over them.
-
-        The dictionary is empty when the budget turns out to be spent.
-        """
-        budget = self.config.minutes * 60 * (1 - self.config.cooldown)
-        if self.cooldown_start is None and self.seconds >= budget:
-            self.cooldown_start = max(1, self.steps_done)
-            if self.finished:
-                return {}
+        """One step over `batch` heads; returns means of row-L1 and of the terms."""
         first = self.steps_done * self.config.batch
         draws = range(first, first + self.config.batch)
         mine = parallel.share_draws(draws)
@@ -232,7 +215,7 @@ class Trainer:
     @property
     def mixed(self) -> bool:
         """Whether unlabelled heads are drawn, too: after a first part of the run."""
-        started = self._progress_share() >= self.config.unlabelled_start
+        started = self.progress >= self.config.unlabelled_start
         return bool(self.unlabelled) and started
 
     def _update(self) -> None:
@@ -307,14 +290,7 @@ class Trainer:
             self.graphs[key] = build_graph(head, self.model.config.graph)
         return self.graphs[key]
 
-    def _progress_share(self) -> float:
-        if self.config.steps is not None:
-            return self.steps_done / max(1, self.config.steps)
-        if self.last_step is not None:
-            return self.steps_done / self.last_step
-        return self.seconds / max(1e-9, self.config.minutes * 60)
-
-    def _progress(self):
+    def _bar(self):
         total, done, unit = self.config.steps, self.steps_done, "step"
         if total is None:
             total, done = round(self.config.minutes * 60), round(self.seconds)
@@ -336,7 +312,7 @@ class Trainer:
 
     def _validation_due(self) -> bool:
         done = len(self.history) + 1
-        return self._progress_share() >= done / max(1, self.config.validations)
+        return self.progress >= done / max(1, self.config.validations)
 
     def validate(self) -> float:
         """Row-L1 on the validation heads; the best model so far is kept."""
@@ -380,7 +356,6 @@ class Trainer:
             "run": self._identity(),
             "steps_done": self.steps_done,
             "seconds": self.seconds,
-            "cooldown_start": self.cooldown_start,
             "best": self.best,
             "recent": self.recent,
             "history": self.history,
@@ -436,7 +411,6 @@ class Trainer:
                     moments["step"] = state["step"]
                 self._moments(parameter).update(moments)
         self.steps_done, self.seconds = progress["steps_done"], progress["seconds"]
-        self.cooldown_start = progress["cooldown_start"]
         self.best, self.history = progress["best"], progress["history"]
         self.recent = progress["recent"]
 
