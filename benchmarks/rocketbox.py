@@ -21,7 +21,7 @@ from tyro.conf import Positional
 from skinlib.datasets.folder import load_folder
 from skinlib.evaluate.compare import evaluate, format_table
 from skinlib.evaluate.groups import topology_groups
-from skinlib.training import TrainConfig, train
+from skinlib.training import TrainConfig, load_model, train
 
 FOLDS = 4
 SHARED = 0.47
@@ -45,6 +45,7 @@ class Run:
     out: Positional[Path]  # folder for the model and the scores
     fold: Literal["0", "1", "2", "3", "none"] = "0"  # which of the folds is held out
     extra: Path | None = None  # folder of more heads, only to train on
+    start: str | None = None  # name or folder of a network to begin with
     config: TrainConfig = field(default_factory=TrainConfig)  # every setting
 
 
@@ -60,7 +61,13 @@ def main(run: Run) -> None:
     extra = [head for head in extra if head.name not in known]
     extra = [head for head in extra if head.name.split("__")[0] not in hidden]
     # No held-out head chooses the step that is kept: it is the last one.
-    model = train(run.config, labelled + extra, run.out / "model", validation=[])
+    model = train(
+        run.config,
+        labelled + extra,
+        run.out / "model",
+        validation=[],
+        start=load_model(run.start) if run.start else None,
+    )
     if not held_out:
         return
     result = evaluate(held_out, train_heads=labelled, model=model)
