@@ -92,6 +92,42 @@ def merged_in_place(weights, parents, bone):
     return weights
 
 
+def relaxed(weights, edges, cotangents, vertex):
+    touching = (edges == vertex).any(axis=1)
+    if not touching.any():
+        return weights[vertex]
+    others = edges[touching].sum(axis=1) - vertex
+    return np.average(weights[others], axis=0, weights=cotangents[touching])
+
+
+def cheapest_bone(distances, radii):
+    known = radii > 0
+    cost = np.where(known, (distances / np.where(known, radii, 1)) ** 2, 1)
+    return cost.argmin(axis=1)
+
+
+def carried(weights, heir):
+    return weights @ np.eye(max(heir) + 1)[heir]
+
+
+def moving_average(values, decay, start=0.0, growing=True):
+    slow, line = start, []
+    for s, value in enumerate(values, 1):
+        d = min(decay, (s - 1) / s) if growing else decay
+        slow = d * slow + (1 - d) * value
+        line.append(slow)
+    return np.array(line)
+
+
+def through_softmax(weights, slopes):
+    return weights * (slopes - (weights * slopes).sum(axis=1, keepdims=True))
+
+
+def kl(predicted, target):
+    ratio = np.where(target > 0, target, 1) / np.where(target > 0, predicted, 1)
+    return (target * np.log(ratio)).sum(axis=1).mean()
+
+
 SOLUTIONS = {
     "00.1": right_bone,
     "00.2": keep_largest,
@@ -105,6 +141,12 @@ SOLUTIONS = {
     "04.2": lambda features: flip(features, [0, 3, 7]),
     "05.1": softmax,
     "05.2": lambda logits, allowed: softmax(np.where(allowed, logits, -np.inf)),
+    "06.1": through_softmax,
+    "06.2": kl,
+    "07.1": relaxed,
+    "07.2": cheapest_bone,
+    "08.1": carried,
+    "08.2": moving_average,
 }
 WRONG = [
     ("00.1", lambda p, t: len(t) * right_bone(p, t), "divide"),
@@ -170,6 +212,67 @@ WRONG = [
     ("05.2", lambda logits, allowed: softmax(logits), "exactly 0"),
     ("05.2", lambda logits, allowed: softmax(logits) * allowed, "before the softmax"),
     ("05.2", lambda logits: logits, "TypeError"),
+    ("06.1", lambda weights, slopes: slopes[0], "shape (2,)"),
+    ("06.1", lambda weights, slopes: weights * slopes, "mean slope"),
+    ("06.1", lambda weights, slopes: weights * (slopes - slopes.mean()), "sums to 0"),
+    (
+        "06.1",
+        lambda weights, slopes: slopes - slopes.mean(axis=1, keepdims=True),
+        "3/8",
+    ),
+    (
+        "06.1",
+        lambda weights, slopes: through_softmax(weights, slopes.clip(-2, 1)),
+        "what torch computes",
+    ),
+    ("06.2", lambda p, y: -(y * np.log(p)).sum(axis=1).mean(), "entropy"),
+    ("06.2", lambda p, y: len(y) * kl(p, y), "number of vertices"),
+    ("06.2", lambda p, y: kl(p, y) / 2, "mean over vertices only"),
+    ("06.2", lambda p, y: kl(y, p), "in front of the logarithm"),
+    ("06.2", lambda p, y: np.abs(p - y).sum(axis=1).mean(), "log(4/3) / 2"),
+    ("06.2", lambda p, y: (y * np.log(y / p)).sum(axis=1).mean(), "0 log 0"),
+    ("07.1", lambda weights, *given: weights, "shape (4, 2)"),
+    ("07.1", lambda weights, edges, cot, v: cot @ weights[[0, 2]], "divide by"),
+    ("07.1", lambda weights, edges, cot, v: weights[[0, 2]].mean(0), "three times"),
+    ("07.1", lambda weights, edges, cot, v: weights[v - 1], "(1/4, 3/4)"),
+    ("07.1", lambda w, edges, cot, v: relaxed(w, edges, cot, 1), "either end"),
+    (
+        "07.1",
+        lambda w, edges, cot, v: relaxed(w, edges, cot, v) * (v < 3),
+        "without edges",
+    ),
+    ("07.2", lambda distances, radii: distances / radii, "shape (3, 2)"),
+    ("07.2", lambda distances, radii: distances.argmin(axis=1), "divide each"),
+    ("07.2", lambda distances, radii: distances.argmax(axis=1), "cheaper than 1"),
+    (
+        "07.2",
+        lambda d, radii: cheapest_bone(d, np.where(radii > 0, radii, 1e-9)),
+        "costs 1",
+    ),
+    ("08.1", lambda weights, heir: weights, "shape (2, 4)"),
+    ("08.1", lambda weights, heir: weights[:, : max(heir) + 1], "still sums to 1"),
+    ("08.1", lambda weights, heir: carried(weights, heir)[:, ::-1], "heir[j]"),
+    (
+        "08.1",
+        lambda weights, heir: weights if len(set(heir)) > 2 else carried(weights, heir),
+        "another order",
+    ),
+    ("08.2", lambda values, decay: moving_average(values, decay)[-1], "shape ()"),
+    (
+        "08.2",
+        lambda values, decay: moving_average(values, decay, growing=False),
+        "first value",
+    ),
+    (
+        "08.2",
+        lambda values, decay: moving_average(values, decay, values[0], growing=False),
+        "mean of all",
+    ),
+    (
+        "08.2",
+        lambda values, decay: np.cumsum(values) / np.arange(1, len(values) + 1),
+        "itself counts",
+    ),
 ]
 
 

@@ -1,7 +1,10 @@
 """The semi-supervised adversarial training: terms, critics, resuming, processes."""
 
+import os
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +26,7 @@ from skinlib.training import (
     TermForms,
     TrainConfig,
     Trainer,
+    load_model,
     train,
 )
 
@@ -180,6 +184,31 @@ def test_a_run_that_was_stopped_ends_in_the_same_bits(heads, bare, tmp_path):
     for name in (WEIGHTS, STATE):
         one, two = load_file(whole / name), load_file(parts / name)
         assert one.keys() == two.keys()
+        assert all(torch.equal(one[key], two[key]) for key in one), name
+
+
+KILLS = int(os.environ.get("SKINLIB_KILLS", "6"))
+
+
+def test_killed_at_any_moment_it_goes_on_from_whole_files(heads, bare, tmp_path):
+    """SKINLIB_KILLS=100 kills it a hundred times."""
+    config = replace(TINY, steps=4 + 2 * KILLS, save_seconds=0.0)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    train(config, heads[:2], whole, bare, validation=heads[:1])
+    rng = np.random.default_rng(KILLS)
+    for _ in range(KILLS):
+        child = os.fork()
+        if child == 0:
+            train(config, heads[:2], parts, bare, validation=heads[:1])
+            os._exit(0)
+        time.sleep(rng.uniform(0.2, 1.5))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        if (parts / WEIGHTS).exists():
+            load_model(parts)
+    train(config, heads[:2], parts, bare, validation=heads[:1])
+    for name in (WEIGHTS, STATE):
+        one, two = load_file(whole / name), load_file(parts / name)
         assert all(torch.equal(one[key], two[key]) for key in one), name
 
 
