@@ -347,3 +347,175 @@ def _masked(masked: Callable) -> str | None:
     if not same(weights, [[1 / 3, 2 / 3, 0], [0.25, 0.25, 0.5]]):
         return "the bones that are left keep their proportions"
     return None
+
+
+# ---- 06 supervised loss
+
+
+@exercise("06.1")
+def _through_softmax(through: Callable) -> str | None:
+    """`through_softmax(weights, slopes)`: from slopes at weights to those at scores."""
+    weights = np.array([[0.75, 0.25], [0.5, 0.5]])
+    slopes = np.array([[1.0, -1.0], [0.0, -2.0]])
+    found = np.asarray(through(weights, slopes))
+    if found.shape != (2, 2):
+        return f"two rows of two bones go in, shape {found.shape} came out"
+    if same(found, weights * slopes):
+        return "subtract the row's mean slope, weighted by P, first"
+    if not same(found.sum(axis=1), [0, 0]):
+        return "each row sums to 0: the mean is the row's own, weighted by P"
+    if not same(found, [[0.375, -0.375], [0.5, -0.5]]):
+        return "for P = (3/4, 1/4) and g = (1, -1) the slopes are 3/8 and -3/8"
+    rng = np.random.default_rng(0)
+    scores = torch.from_numpy(rng.normal(size=(5, 4))).requires_grad_()
+    slopes = rng.normal(size=(5, 4))
+    soft = scores.softmax(dim=1)
+    (wanted,) = torch.autograd.grad((soft * torch.from_numpy(slopes)).sum(), scores)
+    if not same(through(soft.detach().numpy(), slopes), wanted):
+        return "with more bones it differs from what torch computes"
+    return None
+
+
+@exercise("06.2")
+def _kl(kl: Callable) -> str | None:
+    """`kl(predicted, target)`: mean over vertices of KL(target || predicted)."""
+    target = np.array([[0.5, 0.5], [0.25, 0.75]])
+    if not same(kl(target, target), 0):
+        return "it is 0 where both are the same: take off the target's entropy"
+    guess = np.array([[0.25, 0.75], [0.25, 0.75]])
+    found, wanted = kl(guess, target), np.log(4 / 3) / 4
+    if same(found, 2 * wanted):
+        return "divide by the number of vertices"
+    if same(found, wanted / 2):
+        return "sum over bones, mean over vertices only"
+    if same(found, (0.25 * np.log(0.5) + 0.75 * np.log(1.5)) / 2):
+        return "the target is the one in front of the logarithm"
+    if not same(found, wanted):
+        return "for (1/2, 1/2) told as (1/4, 3/4) a row costs log(4/3) / 2"
+    with np.errstate(all="ignore"):
+        sure = kl(np.array([[0.25, 0.75]]), np.array([[0.0, 1.0]]))
+    if not same(sure, np.log(4 / 3)):
+        return "a zero of the target costs nothing: 0 log 0 is 0, not NaN"
+    return None
+
+
+# ---- 07 physical losses
+
+
+@exercise("07.1")
+def _relaxed(relaxed: Callable) -> str | None:
+    """`relaxed(weights, edges, cotangents, vertex)`: (J,) the row of least energy."""
+    weights = np.array([[1.0, 0.0], [0.5, 0.5], [0.0, 1.0], [0.25, 0.75]])
+    edges, cotangents = np.array([[0, 1], [1, 2]]), np.array([1.0, 3.0])
+    row = np.asarray(relaxed(weights.copy(), edges, cotangents, 1))
+    if row.shape != (2,):
+        return f"one row of 2 bones is asked for, shape {row.shape} came out"
+    if same(row, [1, 3]):
+        return "divide by the sum of the cotangents, so that the row sums to 1"
+    if same(row, [0.5, 0.5]):
+        return "an edge of three times the cotangent counts three times"
+    if not same(row, [0.25, 0.75]):
+        return "between (1, 0) with cotangent 1 and (0, 1) with 3 it is (1/4, 3/4)"
+    for end, wanted in ((0, [0.5, 0.5]), (2, [0.5, 0.5])):
+        if not same(relaxed(weights.copy(), edges, cotangents, end), wanted):
+            return "a vertex with one edge takes its neighbour's row, at either end"
+    if not same(relaxed(weights.copy(), edges, cotangents, 3), weights[3]):
+        return "a vertex without edges keeps its row"
+    return None
+
+
+@exercise("07.2")
+def _cheapest_bone(cheapest_bone: Callable) -> str | None:
+    """`cheapest_bone(distances, radii)`: (V,) ids, distances in units of the radii."""
+    distances = np.array([[4.0, 1.0], [1.0, 3.0], [2.0, 2.0]])
+    bones = np.asarray(cheapest_bone(distances.copy(), np.array([8.0, 1.0])))
+    if bones.shape != (3,):
+        return f"3 vertices went in, shape {bones.shape} came out"
+    if same(bones, np.arange(3)[[1, 0, 0]]):
+        return "divide each distance by the radius of its bone"
+    if not same(bones, [0, 0, 0]):
+        return "4 at a reach of 8 is cheaper than 1 at a reach of 1: bone 0"
+    for unknown in (np.nan, 0.0):
+        with np.errstate(all="ignore"):
+            bones = cheapest_bone(distances.copy(), np.array([2.0, unknown]))
+        if not same(np.asarray(bones)[:2], [1, 0]):
+            return f"a bone of radius {unknown:g} costs 1: dearer than 1 / 2, not 4 / 2"
+    return None
+
+
+# ---- 08 consistency
+
+
+@exercise("08.1")
+def _carried(carried: Callable) -> str | None:
+    """`carried(weights, heir)`: (V, J) weights after bones went into their heirs."""
+    weights = np.array([[0.5, 0.25, 0.25, 0], [0, 0.25, 0.25, 0.5]])
+    heir = np.array([0, 1, 0, 1])
+    found = np.asarray(carried(weights.copy(), heir.copy()))
+    if found.shape != (2, 2):
+        return f"the twin has two bones, a table of shape {found.shape} came out"
+    if not same(found.sum(axis=1), [1, 1]):
+        return "each row still sums to 1: several bones may go into the same one"
+    if not same(found, [[0.75, 0.25], [0.25, 0.75]]):
+        return "column j of the original goes into column heir[j] of the twin"
+    order = np.array([2, 1, 0, 3])
+    if not same(carried(weights.copy(), order), weights[:, order]):
+        return "where no bone is lost, the columns are only put in another order"
+    return None
+
+
+@exercise("08.2")
+def _moving_average(moving_average: Callable) -> str | None:
+    """`moving_average(values, decay)`: (S,), the s-th decay at most (s - 1) / s."""
+    values = np.array([4.0, 0.0, 2.0, 6.0])
+    found = np.asarray(moving_average(values.copy(), 0.999))
+    if found.shape != (4,):
+        return f"four values went in, shape {found.shape} came out"
+    if not same(found[0], 4):
+        return "at the first value the decay is 0: slow is the first value"
+    if not same(found, [4, 2, 2, 3]):
+        return "with a large decay it is the mean of all values so far"
+    if not same(moving_average(values.copy(), 0.5), [4, 2, 2, 4]):
+        return "from where (s - 1) / s is above it, `decay` itself counts"
+    return None
+
+
+# ---- 09 critics and WGAN-GP
+
+
+@exercise("09.1")
+def _linear_critic_loss(loss: Callable) -> str | None:
+    """`loss(slope, real, fake, lambda_gp)`: of D(x) = slope x, with its penalty."""
+    real, fake = np.array([1.0, 3.0]), np.array([-1.0, 0.0, 4.0])  # means 2 and 1
+    found = loss(1.0, real, fake, 10.0)
+    if np.shape(found) != ():
+        return f"a loss is one number, shape {np.shape(found)} came out"
+    if same(found, 1):
+        return "the critic wants the fake low and the real high: turn the signs"
+    if not same(found, -1):
+        return "at slope 1 there is no penalty: mean fake score minus mean real score"
+    if not same(loss(2.0, real, fake, 10.0), 8):
+        return "at slope 2 the penalty is 10 (2 - 1)^2, beside a lead of 2"
+    if not same(loss(-1.0, real, fake, 10.0), 1):
+        return "a slope of -1 has length 1, too: its penalty is 0"
+    return None
+
+
+@exercise("09.2")
+def _felt_slope(felt_slope: Callable) -> str | None:
+    """`felt_slope(gradient)`: its norm per vertex, less what moves no row."""
+    gradient = np.array([[1.0, -1.0, 0.0], [0.0, 2.0, -2.0]])
+    found = felt_slope(gradient.copy())
+    if np.shape(found) != ():
+        return f"a norm is one number, shape {np.shape(found)} came out"
+    if same(found, 10**0.5):
+        return "each vertex has 1 / V of a mean: multiply by the root of V"
+    if not same(found, 20**0.5):
+        return "for two vertices with squares 2 and 8 it is the root of 2 x 10"
+    if not same(felt_slope(np.ones((4, 3))), 0):
+        return "the same for all bones moves no row that sums to 1: 0"
+    if not same(felt_slope(gradient + np.array([[5.0], [-3.0]])), 20**0.5):
+        return "take off each row's own mean, axis=1"
+    if not same(felt_slope(np.tile(gradient / 2, (2, 1))), 20**0.5):
+        return "twice the vertices with half the gradient each: the same slope"
+    return None

@@ -128,6 +128,16 @@ def kl(predicted, target):
     return (target * np.log(ratio)).sum(axis=1).mean()
 
 
+def linear_critic_loss(slope, real, fake, lambda_gp):
+    lead = slope * (np.mean(real) - np.mean(fake))
+    return lambda_gp * (abs(slope) - 1) ** 2 - lead
+
+
+def felt_slope(gradient):
+    felt = gradient - gradient.mean(axis=1, keepdims=True)
+    return np.sqrt(len(felt) * np.square(felt).sum())
+
+
 SOLUTIONS = {
     "00.1": right_bone,
     "00.2": keep_largest,
@@ -147,6 +157,8 @@ SOLUTIONS = {
     "07.2": cheapest_bone,
     "08.1": carried,
     "08.2": moving_average,
+    "09.1": linear_critic_loss,
+    "09.2": felt_slope,
 }
 WRONG = [
     ("00.1", lambda p, t: len(t) * right_bone(p, t), "divide"),
@@ -273,6 +285,21 @@ WRONG = [
         lambda values, decay: np.cumsum(values) / np.arange(1, len(values) + 1),
         "itself counts",
     ),
+    ("09.1", lambda slope, real, fake, leash: slope * np.mean(real), "minus"),
+    ("09.1", lambda *given: -linear_critic_loss(*given), "turn the signs"),
+    ("09.1", lambda *given: np.ones(2), "shape (2,)"),
+    ("09.1", lambda slope, *given: linear_critic_loss(slope, *given[:2], 0), "penalty"),
+    (
+        "09.1",
+        lambda w, *given: linear_critic_loss(w, *given) + 40 * (w < 0),
+        "length 1",
+    ),
+    ("09.2", lambda gradient: np.linalg.norm(gradient), "root of V"),
+    ("09.2", lambda gradient: gradient.sum(axis=1), "shape (2,)"),
+    ("09.2", lambda gradient: 2.0, "root of 2 x 10"),
+    ("09.2", lambda g: np.linalg.norm(g) * len(g) ** 0.5, "moves no row"),
+    ("09.2", lambda g: np.linalg.norm(g - g.mean()) * len(g) ** 0.5, "axis=1"),
+    ("09.2", lambda g: felt_slope(g) * (2 / len(g)) ** 0.5, "the same slope"),
 ]
 
 

@@ -42,7 +42,7 @@ class AugmentConfig:
     collapse: float = 0.25  # chance that a head loses bones
     collapse_share: float = 0.1  # part of its bones that it then loses
     mirror: float = 0.5  # chance to swap left and right
-    pose: float = 0.5  # chance to be posed; unlabelled heads never are
+    pose: float = 0.5  # chance to be posed, by the weights it has
     pose_degrees: float = 4.0  # standard deviation of a posed bone's turn
     resemble: float = 0.5  # chance to take over proportions of another training head
     warp: float = 0.8  # largest gradient of a smooth warp, below 1; drawn from 0 up

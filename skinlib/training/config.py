@@ -16,6 +16,7 @@ TWIN = AugmentConfig(
     mirror=0.0,
     resemble=0.0,
     pose=1.0,
+    pose_degrees=1.5,
     warp=0.3,
     stretch=0.05,
     joint_jitter=0.003,
