@@ -31,9 +31,12 @@ def only(**weights: float) -> TermWeights:
     return replace(SUPERVISED_ONLY, **weights)
 
 
-# What differs from TrainConfig; `pseudo` 0: guessed weights are not learnt from.
+# What differs from TrainConfig; `pseudo` 0: guessed weights are not learnt from. The
+# supervised arm never sees an unlabelled head; the others also take over proportions
+# of unlabelled heads (`resemble`), and "proportions" does nothing else with them.
 ARMS = {
     "supervised": {"unlabelled_share": 0.0},
+    "proportions": {"unlabelled_share": 0.0},
     "pseudo-labels": {},
     "consistency": {"pseudo": 0.0, "terms": only(consistency=0.5)},
     "physical": {"pseudo": 0.0, "terms": only(physical=0.001)},
@@ -94,6 +97,7 @@ def main(run: Run) -> None:
         chosen = [training[i] for i in order[: run.labelled]]
         bare = [training[i].replace(weights=None) for i in order[run.labelled :]]
         bare += [head.replace(weights=None) for head in more]
+        bare = bare if arm != "supervised" else []
         config = replace(
             run.config, minutes=run.minutes, threads=run.threads, seed=seed, **ARMS[arm]
         )
