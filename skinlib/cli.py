@@ -1,4 +1,4 @@
-"""The command line: `skinlib skin | train | evaluate | demo | check`.
+"""The command line: `skinlib skin | train | evaluate | lab | demo | check`.
 
 Each command is a function; its signature and docstring are its options and its help.
 Everything slow to import is imported when a command runs, so that `--help` is quick.
@@ -269,6 +269,23 @@ def demo(*, out: Folder = Path("demo")) -> None:
     run_demo(out)
 
 
+def lab(*, port: Annotated[int, arg(metavar="P")] = 8866, browser: bool = True) -> None:
+    """Open the loss lab: learn a small head while you turn the weights of its loss.
+
+    A page for your browser, served by this machine for this machine; Ctrl-C ends it.
+    Notebook 10 says what to try.
+
+    Args:
+        port: Where the page is served; the next free one when it is taken.
+        browser: Open the page; else only say its address.
+    """
+    if not 0 < port < 65536:
+        raise HeadError("--port", f"{port}", "give 1 to 65535")
+    from skinlib.views.lab import serve
+
+    serve(port, browser)
+
+
 def check() -> None:
     """Say what works on this machine; a bug report wants to see it."""
     from skinlib.check import run_checks
@@ -283,6 +300,7 @@ COMMANDS = {
     "skin": skin,
     "train": train,
     "evaluate": evaluate,
+    "lab": lab,
     "demo": demo,
     "check": check,
 }

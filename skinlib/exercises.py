@@ -519,3 +519,40 @@ def _felt_slope(felt_slope: Callable) -> str | None:
     if not same(felt_slope(np.tile(gradient / 2, (2, 1))), 20**0.5):
         return "twice the vertices with half the gradient each: the same slope"
     return None
+
+
+# ---- 10 the loss lab
+
+
+@exercise("10.1")
+def _weights_for(weights_for: Callable) -> str | None:
+    """`weights_for(norms, shares)`: (T,) weights, the first of them 1."""
+    norms, shares = np.array([2.0, 8.0, 0.5]), np.array([0.5, 0.25, 0.25])
+    found = np.asarray(weights_for(norms.copy(), shares.copy()))
+    if found.shape != (3,):
+        return f"three terms went in, shape {found.shape} came out"
+    if not same(found[0], 1):
+        return "divide by the first weight, so that it is 1"
+    if not same(found, [1, 0.125, 2]):
+        return "a term pulls with weight times norm: 1 x 2, w x 8 and w x 0.5"
+    if not same(weights_for(np.array([1.0, 3.0]), np.array([1.0, 0.0])), [1, 0]):
+        return "a term that is to have no share has weight 0"
+    return None
+
+
+@exercise("10.2")
+def _recent_mean(recent_mean: Callable) -> str | None:
+    """`recent_mean(values, count)`: mean of the known ones of the last `count`."""
+    nan = float("nan")
+    values = np.array([8.0, nan, 2.0, nan, 4.0])
+    if not same(recent_mean(values.copy(), 1), 4):
+        return "of the last value alone it is that value"
+    if not same(recent_mean(values.copy(), 3), 3):
+        return "of 2, nothing, 4 it is 3: what is not known does not count"
+    if not same(recent_mean(values.copy(), 99), 14 / 3):
+        return "where there are fewer values than `count`, take them all"
+    with np.errstate(all="ignore"):
+        empty = recent_mean(np.array([1.0, nan]), 1)
+    if empty is None or not np.isnan(empty):
+        return "where nothing is known it is NaN"
+    return None

@@ -66,6 +66,7 @@ def skin(run, *args) -> np.ndarray:
         ("skin", "IN OUT --checkpoint --max-influences --lock --symmetric skinned.glb"),
         ("train", "--labelled --unlabelled --out --minutes --seed --device --start"),
         ("evaluate", "--heads --train-heads --checkpoint --json row-L1"),
+        ("lab", "--port --no-browser Ctrl-C"),
         ("demo", "--out"),
         ("check", "bug report"),
     ],
@@ -374,3 +375,14 @@ def test_check_ends_with_1_when_something_fails(run, monkeypatch, capsys):
     findings.append(check.Finding("FAIL", "torch", "missing"))
     assert run("check") == 1
     assert capsys.readouterr().out.splitlines()[-1].startswith("FAIL  torch")
+
+
+def test_lab_is_served_where_it_is_asked_for(run, monkeypatch, capsys):
+    from skinlib.views import lab
+
+    calls = []
+    monkeypatch.setattr(lab, "serve", lambda *options: calls.append(options))
+    assert run("lab") == run("lab", "--port", 9000, "--no-browser") == 0
+    assert calls == [(8866, True), (9000, False)]
+    assert run("lab", "--port", 0) == 2
+    assert "--port" in capsys.readouterr().err

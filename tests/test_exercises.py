@@ -119,6 +119,17 @@ def moving_average(values, decay, start=0.0, growing=True):
     return np.array(line)
 
 
+def weights_for(norms, shares):
+    weights = shares / norms
+    return weights / weights[0]
+
+
+def recent_mean(values, count):
+    known = values[-count:]
+    known = known[~np.isnan(known)]
+    return known.mean() if len(known) else np.nan
+
+
 def through_softmax(weights, slopes):
     return weights * (slopes - (weights * slopes).sum(axis=1, keepdims=True))
 
@@ -159,6 +170,8 @@ SOLUTIONS = {
     "08.2": moving_average,
     "09.1": linear_critic_loss,
     "09.2": felt_slope,
+    "10.1": weights_for,
+    "10.2": recent_mean,
 }
 WRONG = [
     ("00.1", lambda p, t: len(t) * right_bone(p, t), "divide"),
@@ -300,6 +313,22 @@ WRONG = [
     ("09.2", lambda g: np.linalg.norm(g) * len(g) ** 0.5, "moves no row"),
     ("09.2", lambda g: np.linalg.norm(g - g.mean()) * len(g) ** 0.5, "axis=1"),
     ("09.2", lambda g: felt_slope(g) * (2 / len(g)) ** 0.5, "the same slope"),
+    ("10.1", lambda norms, shares: shares[0], "shape ()"),
+    ("10.1", lambda norms, shares: shares / norms, "divide by the first"),
+    ("10.1", lambda norms, shares: shares / shares[0], "weight times norm"),
+    (
+        "10.1",
+        lambda norms, shares: norms[0] / norms * np.maximum(shares, 0.25) / shares[0],
+        "no share",
+    ),
+    ("10.2", lambda values, count: np.nanmean(values), "that value"),
+    ("10.2", lambda values, count: np.mean(values[-count:]), "does not count"),
+    (
+        "10.2",
+        lambda values, count: np.nanmean(values[-count:] if count < 9 else values[1:]),
+        "take them all",
+    ),
+    ("10.2", lambda values, count: np.nan_to_num(recent_mean(values, count)), "NaN"),
 ]
 
 
