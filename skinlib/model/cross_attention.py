@@ -56,7 +56,7 @@ class CrossAttention(nn.Module):
         bone_width: int = 128,
         pair_width: int = 32,
         heads: int = 4,
-        chunk: int = 32_768,
+        chunk: int = 16_384,
     ):
         super().__init__()
         self.chunk, self.pair_width = chunk, pair_width
