@@ -88,8 +88,8 @@ def main(run: Run) -> None:
     path = run.out / "results.json"
     run.out.mkdir(parents=True, exist_ok=True)
     results = json.loads(path.read_text()) if path.exists() else {}
-    todo = [(seed, arm) for seed in run.seeds for arm in run.arms]
-    for seed, arm in tqdm(todo, unit="run"):
+    pairs = [(seed, arm) for seed in run.seeds for arm in run.arms]
+    for seed, arm in tqdm(pairs, unit="run"):
         key = f"{arm} / {run.labelled} / {run.minutes:g} min / seed {seed}"
         if key in results:
             continue
