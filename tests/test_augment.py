@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from skinlib.datasets import augment as module
 from skinlib.datasets.augment import (
+    UNDISTURBED,
     AugmentConfig,
     Warp,
     apply_pose,
@@ -34,17 +35,6 @@ STEPS = (
     "reorder_vertices drop_islands flip_edges cut_seams"
 ).split()
 NEW_MESH = ("reorder_vertices", "drop_islands", "flip_edges", "cut_seams")
-OFF = AugmentConfig(
-    collapse=0,
-    mirror=0,
-    pose=0,
-    warp=0,
-    stretch=0,
-    rotate=0,
-    jitter=0,
-    joint_jitter=0,
-    reorder_bones=False,
-)
 ALL = AugmentConfig(
     collapse=1,
     mirror=1,
@@ -127,7 +117,7 @@ def test_an_unlabelled_head_cannot_be_posed(head):
         pose(head.replace(weights=None), np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("config", [AugmentConfig(), ALL, OFF])
+@pytest.mark.parametrize("config", [AugmentConfig(), ALL, UNDISTURBED])
 @pytest.mark.parametrize("seed", range(6))
 def test_augment_is_valid_and_decided_by_the_seed(config, seed):
     head, others = synthetic_head(seed, 700), [synthetic_head(seed + 6, 700)]
@@ -176,8 +166,8 @@ def test_resemble_leaves_a_head_alone_that_shares_no_names(head):
 
 
 def test_augment_with_everything_off_changes_nothing(head):
-    assert OFF.keeps_mesh and AugmentConfig().keeps_mesh and not ALL.keeps_mesh
-    assert_same(augment(head, np.random.default_rng(0), OFF), head)
+    assert UNDISTURBED.keeps_mesh and AugmentConfig().keeps_mesh and not ALL.keeps_mesh
+    assert_same(augment(head, np.random.default_rng(0), UNDISTURBED), head)
 
 
 def test_scale_is_exact(head):

@@ -65,6 +65,20 @@ class AugmentConfig:
         return not (any(changes) or self.reorder_vertices)
 
 
+UNDISTURBED = AugmentConfig(
+    collapse=0.0,
+    mirror=0.0,
+    pose=0.0,
+    resemble=0.0,
+    warp=0.0,
+    stretch=0.0,
+    rotate=0.0,
+    jitter=0.0,
+    joint_jitter=0.0,
+    reorder_bones=False,
+)
+
+
 def augment(
     head: Head,
     rng: np.random.Generator,

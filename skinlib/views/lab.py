@@ -22,7 +22,7 @@ import torch
 import torch.nn.functional as F
 from matplotlib.ticker import LogLocator
 
-from skinlib.datasets.augment import AugmentConfig
+from skinlib.datasets.augment import UNDISTURBED
 from skinlib.datasets.synthetic import synthetic_head
 from skinlib.evaluate.metrics import row_l1
 from skinlib.geometry import cotangents
@@ -189,19 +189,6 @@ NETWORK = ModelConfig(
     pair_width=16,
     heads=2,
     graph=GraphConfig(neighbours=8, nearest=4),
-)
-UNDISTURBED = AugmentConfig(
-    collapse=0.0,
-    mirror=0.0,
-    pose=0.0,
-    resemble=0.0,
-    warp=0.0,
-    stretch=0.0,
-    rotate=0.0,
-    scale=1.0,
-    jitter=0.0,
-    joint_jitter=0.0,
-    reorder_bones=False,
 )
 
 
