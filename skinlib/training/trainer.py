@@ -2,9 +2,9 @@
 
 Step s of a run depends on the seed, s and the parameters, on nothing else: each head is
 drawn, disturbed and differentiated by itself, on one thread, and the gradients are
-summed in a fixed order. So a run of so many steps that was interrupted ends in the same
-bits as one that was not, and the number of threads changes the time, not the result. In a
-run of so many minutes the clock decides how many steps there are, and how they cool down.
+summed in a fixed order. So a run in steps that was interrupted ends in the same bits as
+one that was not, and the number of threads changes the time, not the result. In a run
+in minutes the clock decides how many steps there are, and how they cool down.
 """
 
 import contextlib
