@@ -181,6 +181,26 @@ def test_the_seed_decides_everything():
     assert tails == {True, False}
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_another_face_on_the_same_mesh(seed):
+    head, other, third = (synthetic_head(seed, face=face) for face in (None, 1, 2))
+    for face in (other, third):
+        np.testing.assert_array_equal(face.faces, head.faces)
+        np.testing.assert_array_equal(face.weights, head.weights)
+        assert face.skeleton.names == head.skeleton.names
+        size = np.linalg.norm(np.ptp(head.vertices, axis=0))
+        moved = np.linalg.norm(face.vertices - head.vertices, axis=1) / size
+        assert 0.003 < moved.mean() < 0.1
+        # Bones move along: each eye still lies in the middle of its ball.
+        for side in "LR":
+            eye = face.skeleton.names.index(f"eye_{side}")
+            ball = face.vertices[face.weights[:, eye] == 1]
+            middle = (ball.min(axis=0) + ball.max(axis=0)) / 2
+            apart = np.linalg.norm(middle - face.skeleton.joints[eye])
+            assert apart < 0.01 * size
+    assert not np.allclose(other.vertices, third.vertices)
+
+
 def test_options_are_kept():
     head = synthetic_head(0, 900, bones=8, unit="m", up="z", shuffle=False)
     assert abs(len(head.vertices) - 900) < 90

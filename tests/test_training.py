@@ -127,7 +127,9 @@ def test_the_learning_rate_warms_up_and_cools_down(heads, tmp_path):
 
 def test_unlabelled_heads_are_drawn_after_a_while(heads, tmp_path, monkeypatch):
     bare = [head.replace(weights=None) for head in heads[1:]]
-    config = replace(CONFIG_OF_TESTS, unlabelled_share=1.0, unlabelled_start=0.5)
+    config = replace(
+        CONFIG_OF_TESTS, unlabelled_share=1.0, unlabelled_start=0.5, pseudo=1.0
+    )
     guessed = []
     original = Trainer._guess
 
@@ -278,7 +280,11 @@ def test_a_run_with_unlabelled_heads_resumes_to_the_same_bits(
     heads, tmp_path, monkeypatch
 ):
     config = replace(
-        CONFIG_OF_TESTS, unlabelled_share=0.5, unlabelled_start=0.2, optimizer="adamw"
+        CONFIG_OF_TESTS,
+        unlabelled_share=0.5,
+        unlabelled_start=0.2,
+        pseudo=1.0,
+        optimizer="adamw",
     )
     others = {"unlabelled": heads[1:2], "validation": heads[2:]}
     train(config, heads[:1], tmp_path / "whole", **others)

@@ -64,6 +64,17 @@ class AugmentConfig:
         changes = self.drop_islands, self.flip_edges, self.cut_seams
         return not (any(changes) or self.reorder_vertices)
 
+    @property
+    def on_the_same_mesh(self) -> "AugmentConfig":
+        """The same changes, without those of vertices and triangles."""
+        return dataclasses.replace(
+            self,
+            drop_islands=0.0,
+            flip_edges=0.0,
+            cut_seams=0.0,
+            reorder_vertices=False,
+        )
+
 
 UNDISTURBED = AugmentConfig(
     collapse=0.0,

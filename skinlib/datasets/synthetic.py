@@ -15,7 +15,7 @@ Weights are functions of (theta, phi), the landmarks and the bones that are ther
 of vertices or triangles: two meshes of one head have the same weights at one place.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -94,6 +94,21 @@ class HeadShape:
             values["lid_opening"] = 0.0
         return cls(**values)
 
+    def sculpted(self, rng: np.random.Generator) -> "HeadShape":
+        """Another plausible person, with mouth and eyes at the same places."""
+        kept = {name: getattr(self, name) for name in _LANDMARK_FIELDS}
+        return replace(HeadShape.random(rng), **kept)
+
+
+# What the mesh is laid out by.
+_LANDMARK_FIELDS = (
+    "mouth_width",
+    "mouth_height",
+    "eye_spacing",
+    "eye_height",
+    "eye_radius",
+)
+
 
 class Regions(NamedTuple):
     """Vertex ids of the parts that touch, or that lie apart from the skin.
@@ -117,6 +132,7 @@ def synthetic_head(
     unit: str | None = None,
     up: str | None = None,
     shape: HeadShape | None = None,
+    face: int | None = None,
     shuffle: bool = True,
 ) -> Head:
     """A head with exact, smooth skin weights; what is not given is drawn by the seed.
@@ -129,6 +145,8 @@ def synthetic_head(
         up: `"y"`, the face looking along +z, or `"z"`, it looking along -y. The
             person's left is +x.
         shape: the proportions.
+        face: a seed of its own: another face, sculpted out of the same mesh, as a
+            studio makes its next character; vertices keep their ids and weights.
         shuffle: put vertices, faces and bones in random order, so that ids tell
             nothing.
 
@@ -140,7 +158,14 @@ def synthetic_head(
     (8, True)
     """
     return synthetic_head_and_regions(
-        seed, vertices, bones=bones, unit=unit, up=up, shape=shape, shuffle=shuffle
+        seed,
+        vertices,
+        bones=bones,
+        unit=unit,
+        up=up,
+        shape=shape,
+        face=face,
+        shuffle=shuffle,
     )[0]
 
 
@@ -166,6 +191,7 @@ def synthetic_head_and_regions(
     unit: str | None = None,
     up: str | None = None,
     shape: HeadShape | None = None,
+    face: int | None = None,
     shuffle: bool = True,
 ) -> tuple[Head, Regions]:
     """`synthetic_head`, and which of its vertices are lips, lids and eyes."""
@@ -191,6 +217,12 @@ def synthetic_head_and_regions(
     points = np.concatenate([skin, balls])
     faces = np.concatenate([mesh.faces, ball_faces + len(skin)])
     faces = flip_edges(points, faces, mesh_rng, mesh_rng.uniform(0, 0.6))
+    if face is not None:
+        eyes = _eye_centres(shape, landmarks).repeat(eye_count, axis=0)
+        shape = shape.sculpted(np.random.default_rng(face))
+        skin, away = _place(mesh, shape, landmarks), balls - eyes
+        balls = _eye_centres(shape, landmarks).repeat(eye_count, axis=0) + away
+        points = np.concatenate([skin, balls])
 
     names = _choose_bones(bones, bone_rng)
     # FBX and glTF know no tails, so some rigs have none at their leaves.

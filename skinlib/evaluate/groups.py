@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from skinlib.geometry import mesh_edges, weld
+from skinlib.geometry import neighbourhood_kinds
 from skinlib.head import Head
 
 # There is no gap between edits of one mesh and other heads: similarity falls off
@@ -80,26 +80,5 @@ def group_split(
 
 
 def _neighbourhoods(head: Head) -> np.ndarray:
-    """Sorted kinds of vertex neighbourhood, as 64-bit Weisfeiler-Lehman colours.
-
-    A vertex starts with its number of neighbours; each round mixes in the sum of the
-    neighbours' hashed colours.
-    """
-    edges = mesh_edges(weld(head.vertices)[head.faces])
-    count = int(edges.max(initial=-1)) + 1
-    a, b = np.concatenate([edges, edges[:, ::-1]]).T
-    colour = np.bincount(a, minlength=count).astype(np.uint64)
-    for _ in range(ROUNDS):
-        mixed = _mix(colour)
-        total = np.zeros(count, np.uint64)
-        np.add.at(total, a, mixed[b])
-        colour = _mix(mixed * np.uint64(3) + total)
-    return np.unique(colour) if count else np.zeros(1, np.uint64)
-
-
-def _mix(values: np.ndarray) -> np.ndarray:
-    """The finaliser of splitmix64 (Steele, Lea and Flood 2014): spreads all bits."""
-    values = values + np.uint64(0x9E3779B97F4A7C15)
-    values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return values ^ (values >> np.uint64(31))
+    """Sorted kinds of vertex neighbourhood."""
+    return np.unique(neighbourhood_kinds(head.vertices, head.faces, ROUNDS))

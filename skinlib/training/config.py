@@ -74,9 +74,10 @@ class TrainConfig:
     validation_share: float = 0.08  # of the heads, when no validation heads are given
     validations: int = 20  # how often the run is validated
     save_seconds: float = 60.0  # how often the state to resume from is written
-    unlabelled_share: float = 0.25  # of the draws, when unlabelled heads are given
-    unlabelled_start: float = 0.3  # part of the run after which they are drawn
-    pseudo: float = 1.0  # how much a guessed row counts, beside an artist's
+    unlabelled_share: float = 0.5  # of the draws, when unlabelled heads are given
+    unlabelled_start: float = 0.0  # part of the run after which they are drawn
+    propagate: bool = True  # unlabelled heads take over rows, see `Propagation`
+    pseudo: float = 0.0  # how much a guessed row counts, beside an artist's
     critic_learning_rate: float = 5e-4  # of both critics, on the same schedule
     critic_steps: int = 1  # steps of the critics for one of the generator
     penalty: float = 10.0  # lambda_gp, of the critics' gradient penalty

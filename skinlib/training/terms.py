@@ -37,10 +37,12 @@ D_S, D_U = "adversarial_s", "adversarial_u"
 
 @dataclass(frozen=True)
 class Sample:
-    """A disturbed head and its graph; unlabelled ones carry weights that are guessed.
+    """A disturbed head and its graph; what nobody painted is guessed.
 
     Attributes:
-        labelled: whether the weights are an artist's.
+        labelled: whether an artist painted it.
+        known: (N,) bool, nodes whose weights are an artist's, painted here or taken
+            over from another head.
         mixed: whether unlabelled heads are being drawn too, as D_u needs.
         mix: 0 .. 1, where between real and generated weights the penalty is taken.
     """
@@ -48,6 +50,7 @@ class Sample:
     head: Head
     graph: HybridGraph
     labelled: bool
+    known: np.ndarray
     mixed: bool
     mix: float
 
@@ -98,8 +101,8 @@ class Terms:
             logits = self.model.node_logits(mesh, skeleton, judged)
             predicted, terms, critics, scores = logits.softmax(dim=1), {}, None, {}
         goal = target[judged]
-        weight = 1.0 if sample.labelled else config.pseudo
-        terms["supervised"] = weight * supervised(logits, goal, config.loss)
+        known = torch.from_numpy(sample.known).to(device)[judged]
+        terms["supervised"] = self._supervised(logits, goal, known)
         if config.terms.consistency:
             twin = augment(sample.head, rng, config.twin)
             again = self.model.node_logits(
@@ -114,6 +117,15 @@ class Terms:
         error = row_l1(predicted.detach(), goal).item()
         shown["row_l1" if sample.labelled else "guess_row_l1"] = error
         return Losses(total(terms, config.terms), critics, shown)
+
+    def _supervised(self, logits, goal, known) -> Tensor:
+        """L_sup, in which a row that nobody painted counts `pseudo`."""
+        loss = logits.new_zeros(())
+        for rows, weight in ((known, 1.0), (~known, self.config.pseudo)):
+            if weight and rows.any():
+                part = supervised(logits[rows], goal[rows], self.config.loss)
+                loss = loss + weight * rows.float().mean() * part
+        return loss
 
     def _whole(self, predicted, target, sample, mesh, skeleton) -> dict[str, Tensor]:
         """The generator's terms that need all nodes of a head."""

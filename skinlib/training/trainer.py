@@ -42,6 +42,7 @@ from skinlib.training.checkpoint import (
     write_tensors,
 )
 from skinlib.training.config import TrainConfig
+from skinlib.training.propagation import Propagation
 from skinlib.training.terms import D_S, D_U, Sample, Terms
 
 HISTORY = "history.json"
@@ -79,6 +80,8 @@ def train(
 class Trainer:
     """One training run; see `train`. `step()` is one step, for a look inside."""
 
+    clock = staticmethod(time.monotonic)  # what the minutes of a run are read from
+
     def __init__(
         self,
         config: TrainConfig,
@@ -101,6 +104,7 @@ class Trainer:
         self.validation = list(validation)
         _check_weights(self.validation, "judge by skinned heads")
         self.graphs: dict[int, HybridGraph] = {}
+        self.carried = self._carry()
 
         torch.manual_seed(config.seed)
         self.model = SkinningModel(start.config if start else config.model)
@@ -144,9 +148,9 @@ class Trainer:
                     # First, as the run may have been stopped when it was due.
                     if self._validation_due():
                         self.validate()
-                    began = time.monotonic()
+                    began = self.clock()
                     self.step()
-                    self.seconds += time.monotonic() - began
+                    self.seconds += self.clock() - began
                     self.seconds = parallel.from_first(self.seconds)
                     self._show(bar)
                     if time.monotonic() - saved > self.config.save_seconds:
@@ -216,8 +220,15 @@ class Trainer:
     @property
     def mixed(self) -> bool:
         """Whether unlabelled heads are drawn, too: after a first part of the run."""
-        started = self.progress >= self.config.unlabelled_start
-        return bool(self.unlabelled) and started
+        return bool(self.useful) and self.progress >= self.config.unlabelled_start
+
+    @property
+    def useful(self) -> list[int]:
+        """The unlabelled heads from which something can be learnt."""
+        config, terms = self.config, self.config.terms
+        if config.pseudo or terms.adversarial_u or terms.consistency or terms.physical:
+            return list(range(len(self.unlabelled)))
+        return [i for i, (_, known) in enumerate(self.carried) if known.any()]
 
     def _update(self) -> None:
         """Follow the gradients; the averaged parameters follow slowly."""
@@ -240,12 +251,16 @@ class Trainer:
         if self.config.device == "cpu":
             torch.set_num_threads(1)
         rng = np.random.default_rng([self.config.seed, 1, draw])
-        head, graph, labelled = self._draw(draw, rng)
+        head, graph, labelled, known = self._draw(draw, rng)
         others = self.labelled + self.unlabelled
-        head = augment(head, rng, self.config.augment, others)
-        if not self.config.augment.keeps_mesh:
+        changes = self.config.augment
+        # Nobody could tell any longer which vertices are known.
+        changes = changes if labelled else changes.on_the_same_mesh
+        head = augment(head, rng, changes, others)
+        if not changes.keeps_mesh:
             graph = build_graph(head, self.model.config.graph)
-        sample = Sample(head, graph, labelled, self.mixed, mix=float(rng.random()))
+        mix = float(rng.random())
+        sample = Sample(head, graph, labelled, known, self.mixed, mix)
         losses = self.terms.losses(sample, rng)
         gradients = []
         for name, network in self.networks.items():
@@ -264,20 +279,34 @@ class Trainer:
 
     def _draw(
         self, draw: int, rng: np.random.Generator
-    ) -> tuple[Head, HybridGraph, bool]:
-        """Head, graph, and is it labelled; unlabelled ones come with guessed weights.
+    ) -> tuple[Head, HybridGraph, bool, np.ndarray]:
+        """Head with weights, graph, is it labelled, and (N,) which nodes are known.
 
         Labelled heads come in shuffled epochs.
         """
         if self.mixed and rng.random() < self.config.unlabelled_share:
-            place = int(rng.integers(len(self.unlabelled)))
-            head = self.unlabelled[place]
+            place = self.useful[int(rng.integers(len(self.useful)))]
+            head, (weights, known) = self.unlabelled[place], self.carried[place]
             graph = self._graph(len(self.labelled) + place, head)
-            return head.replace(weights=self._guess(head, graph)), graph, False
+            if self.config.pseudo or not known.any():
+                weights = np.where(known[:, None], weights, self._guess(head, graph))
+            head = head.replace(weights=weights)
+            return head, graph, False, known[graph.vertex_of_node]
         epoch, place = divmod(draw, len(self.labelled))
         shuffle = np.random.default_rng([self.config.seed, 2, epoch])
         place = int(shuffle.permutation(len(self.labelled))[place])
-        return self.labelled[place], self._graph(place, self.labelled[place]), True
+        head, graph = self.labelled[place], self._graph(place, self.labelled[place])
+        return head, graph, True, np.ones(len(graph), bool)
+
+    def _carry(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """(V, J) weights and (V,) known ones of each unlabelled head."""
+        if not self.unlabelled:
+            return []
+        painted = Propagation(self.labelled)
+        carried = [painted.rows(head) for head in self.unlabelled]
+        if not self.config.propagate:
+            return [(weights, np.zeros_like(known)) for weights, known in carried]
+        return carried
 
     @torch.no_grad()
     def _guess(self, head: Head, graph: HybridGraph) -> np.ndarray:

@@ -172,11 +172,13 @@ class _Trainer(Trainer):
         count = len(self.labelled)
         if not odd:
             head = self.labelled[turn % count]
-            return head, self._graph(turn % count, head), True
+            graph = self._graph(turn % count, head)
+            return head, graph, True, np.ones(len(graph), bool)
         place = turn % len(self.unlabelled)
         head = self.unlabelled[place]
         graph = self._graph(count + place, head)
-        return head.replace(weights=self._guess(head, graph)), graph, False
+        head = head.replace(weights=self._guess(head, graph))
+        return head, graph, False, np.zeros(len(graph), bool)
 
 
 # So small that a step takes less than a blink.
