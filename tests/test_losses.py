@@ -71,6 +71,8 @@ def test_supervised_is_the_weighted_sum():
     expected = default.row_l1 * terms[0] + default.cross_entropy * terms[1]
     torch.testing.assert_close(supervised(logits, TARGET), expected)
     assert supervised(logits, TARGET, LossWeights(0, 0, 0)).item() == 0
+    source = supervised(logits, TARGET, LossWeights(0, 0, 1, balance=0.7))
+    assert source == seed_supervised(predicted, TARGET, balance=0.7)
 
 
 TERMS = {

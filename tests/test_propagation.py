@@ -84,13 +84,29 @@ def test_order_of_vertices_and_bones_and_unit_do_not_matter(painted):
 def test_another_mesh_is_hardly_known(painted):
     other = synthetic_head(SEED + 1, 1500)
     _, known = Propagation([painted]).rows(other.replace(weights=None))
-    assert known.mean() < 0.1
+    assert not known.any()
 
 
 def test_the_nearest_of_several_painted_heads_decides(painted, sculpted):
-    stranger = sculpted.replace(weights=np.roll(sculpted.weights, 1, axis=1))
-    weights, known = Propagation([stranger, painted]).rows(painted)
-    assert (error(weights, painted)[known] < 1e-4).mean() > 0.9
+    blurred = 0.98 * sculpted.weights + 0.02 * np.roll(sculpted.weights, 1, axis=1)
+    weights, known = Propagation([sculpted.replace(weights=blurred), painted]).rows(
+        painted
+    )
+    assert known.mean() > 0.5
+    assert (error(weights, painted)[known] < 1e-4).all()
+
+
+def test_where_artists_disagree_nothing_is_known(painted, sculpted):
+    jaw = sculpted.skeleton.names.index("jaw")
+    eye = sculpted.skeleton.names.index("eye_L")
+    swapped = sculpted.weights.copy()
+    swapped[:, [jaw, eye]] = swapped[:, [eye, jaw]]
+    stranger = sculpted.replace(weights=swapped)
+    _, alone = Propagation([painted]).rows(painted)
+    _, known = Propagation([painted, stranger]).rows(painted)
+    moved = painted.weights[:, [jaw, eye]].max(axis=1) > 0.2
+    assert alone[moved].mean() > 0.9 and not known[moved].any()
+    assert known[~moved].mean() > 0.5
 
 
 def test_rows_on_bones_that_are_not_there_are_not_known(painted):

@@ -60,6 +60,7 @@ class LossWeights:
     row_l1: float = 1.0  # sum over bones of absolute differences
     cross_entropy: float = 0.3  # cross-entropy to the artist's rows
     seed: float = 0.0  # the source's L_sup
+    balance: float = 0.1  # lambda, of the cosine in the source's L_sup
 
 
 def supervised(
@@ -78,5 +79,7 @@ def supervised(
     if weights.cross_entropy:
         total = total + weights.cross_entropy * cross_entropy(logits, target)
     if weights.seed:
-        total = total + weights.seed * seed_supervised(predicted, target)
+        total = total + weights.seed * seed_supervised(
+            predicted, target, weights.balance
+        )
     return total

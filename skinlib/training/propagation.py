@@ -19,6 +19,7 @@ REACH = 0.25  # in the frame of the bones: how far the same vertex may have move
 APART = 1e3 * REACH  # between two kinds of neighbourhood, so that no search mixes them
 WITNESSES = 4  # painted vertices that are asked
 DISAGREE = 0.1  # row-L1, how far their rows may lie apart on average
+FAMILY = 0.1  # of the vertices; a head with fewer known ones shares them by chance
 LOST = 0.01  # weight that may lie on bones which the other skeleton has not
 
 
@@ -77,6 +78,8 @@ class Propagation:
             spread[there] += apart
             count[there] += 1
         known &= spread <= DISAGREE * count
+        if known.mean() < FAMILY:
+            known[:] = False
         # What hangs on bones that are not there goes to the root.
         weights[:, int(np.argmin(head.skeleton.parents))] += 1 - total
         return weights, known

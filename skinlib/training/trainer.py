@@ -140,6 +140,8 @@ class Trainer:
     def run(self) -> SkinningModel:
         """Train to the end of the budget and return the best model."""
         self.out.mkdir(parents=True, exist_ok=True)
+        if self.unlabelled and parallel.is_first():
+            tqdm.write(self.describe_unlabelled())
         saved = time.monotonic()
         with self._bar() as bar, ThreadPoolExecutor(self.config.threads) as pool:
             self._pool = pool
@@ -229,6 +231,14 @@ class Trainer:
         if config.pseudo or terms.adversarial_u or terms.consistency or terms.physical:
             return list(range(len(self.unlabelled)))
         return [i for i, (_, known) in enumerate(self.carried) if known.any()]
+
+    def describe_unlabelled(self) -> str:
+        """What is learnt from the unlabelled heads, in words."""
+        known = [mask.mean() for _, mask in self.carried if mask.any()]
+        words = f"{len(known)} of {len(self.carried)} unlabelled heads"
+        if known:
+            words += f" share {np.mean(known):.0%} of their vertices"
+        return f"{words} with a labelled head, sculpted anew; all lend proportions."
 
     def _update(self) -> None:
         """Follow the gradients; the averaged parameters follow slowly."""

@@ -19,7 +19,6 @@ from pathlib import Path
 import ipywidgets
 import numpy as np
 import torch
-import torch.nn.functional as F
 from matplotlib.ticker import LogLocator
 
 from skinlib.datasets.augment import UNDISTURBED
@@ -84,19 +83,17 @@ class LabSettings(TermWeights):
         object.__setattr__(self, "as_written", written)
 
     @property
-    def weights(self) -> "_Weights":
-        """Alpha to epsilon, and what L_sup lacks of its cosine."""
+    def weights(self) -> TermWeights:
+        """Alpha to epsilon; those of critics that are off are 0."""
         given = {f.name: getattr(self, f.name) for f in fields(TermWeights)}
         if not self.critics:
             given |= {D_S: 0.0, D_U: 0.0}
-        # `LossWeights.seed` stands for a balance of 0.1.
-        lacks = 0.1 - self.balance if "supervised" in self.as_written else 0.0
-        return _Weights(**given, cosine=self.supervised * lacks)
+        return TermWeights(**given)
 
     def config(self, base: TrainConfig) -> TrainConfig:
         """The training configuration that these settings mean."""
         written = [field for name in self.as_written for field in FORMS[name]]
-        source = LossWeights(row_l1=0.0, cross_entropy=0.0, seed=1.0)
+        source = LossWeights(0.0, 0.0, seed=1.0, balance=self.balance)
         return replace(
             base,
             terms=self.weights,
@@ -106,13 +103,8 @@ class LabSettings(TermWeights):
         )
 
 
-@dataclass(frozen=True)
-class _Weights(TermWeights):
-    cosine: float = 0.0
-
-
 class _Terms(Terms):
-    """The terms of a run, with the cosine apart, and nothing guessed for a label."""
+    """The terms of a run, with nothing guessed for a label."""
 
     def __init__(self, config, model, critics):
         super().__init__(config, model, critics)
@@ -132,12 +124,6 @@ class _Terms(Terms):
         if key not in self.edges:
             self.edges[key] = [torch.from_numpy(a) for a in cotangents(points, faces)]
         return dirichlet(predicted, *self.edges[key])
-
-    def _whole(self, predicted, target, sample, mesh, skeleton):
-        terms = super()._whole(predicted, target, sample, mesh, skeleton)
-        if sample.labelled and self.config.terms.cosine:
-            terms["cosine"] = F.cosine_similarity(predicted, target, dim=1).mean()
-        return terms
 
 
 class _Trainer(Trainer):
@@ -272,8 +258,6 @@ class LabRun:
         for _ in range(count):
             self._apply()
             means = self._trainer.step()
-            cosine = means.pop("cosine", 0.0)
-            means["supervised"] += (0.1 - self._applied.balance) * cosine
             if (self.steps - 1) % JUDGE_EVERY == 0:
                 means["held_out"] = float(self.errors("held out").mean())
             for name, curve in self.curves.items():
