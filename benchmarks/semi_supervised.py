@@ -5,7 +5,8 @@
 Of the training heads of a fold (see rocketbox.py) `labelled` keep their weights; the
 others lose them and join MORE. Every arm has the same heads, seeds and minutes of
 processor time, and is judged on the held-out heads, of topology groups that it never
-saw, with or without weights. An arm and seed that is in OUT already is not run again.
+saw, with or without weights, and on those whose weights it did not get to see. An arm
+and seed that is in OUT already is not run again; several processes may share OUT.
 """
 
 import json
@@ -80,46 +81,76 @@ class Run:
     fold: int | None = None  # which is held out; None: fold s of seed s
     seeds: tuple[int, ...] = (0, 1, 2)  # of the choice of heads and of the training
     arms: tuple[str, ...] = tuple(ARMS)  # which arms
-    minutes: float = 5.0  # of each run
-    threads: int = 2  # of each run
+    minutes: float = 5.0  # of processor time, of each run
     config: TrainConfig = field(default_factory=TrainConfig)  # what all arms share
 
 
 def main(run: Run) -> None:
-    """Run what is missing, then print mean and spread of each arm."""
+    """Run what is missing, then print and write what is there."""
     heads = load_folder(run.heads)
     more = load_folder(run.unlabelled) if run.unlabelled else []
-    path = run.out / "results.json"
-    run.out.mkdir(parents=True, exist_ok=True)
-    results = json.loads(path.read_text()) if path.exists() else {}
-    pairs = [(seed, arm) for seed in run.seeds for arm in run.arms]
-    for seed, arm in tqdm(pairs, unit="run"):
-        key = f"{arm} / {run.labelled} / {run.minutes:g} min / seed {seed}"
-        if key in results:
+    for seed, arm in tqdm([(s, a) for s in run.seeds for a in run.arms], unit="run"):
+        words = arm.replace(",", "").replace(" ", "-")
+        name = f"{words}_{run.labelled}_{run.minutes:g}-min_seed-{seed}"
+        folder = run.out / name
+        if (folder / "scores.json").exists():
             continue
-        fold = seed % FOLDS if run.fold is None else run.fold
-        training, held_out = split(heads, fold)
-        order = np.random.default_rng(seed).permutation(len(training))
-        count = len(training) if arm == "all labels" else run.labelled
-        chosen = [training[i] for i in order[:count]]
-        bare = [training[i].replace(weights=None) for i in order[count:]]
-        bare += [head.replace(weights=None) for head in apart(more, held_out)]
-        bare = bare if arm not in ("supervised", "all labels") else []
-        config = replace(
-            run.config, minutes=run.minutes, threads=run.threads, seed=seed, **ARMS[arm]
+        training, held_out = split(
+            heads, seed % FOLDS if run.fold is None else run.fold
         )
-        folder = run.out / key.replace(" / ", "_").replace(" ", "-").replace(",", "")
-        model = ByProcessorTime(config, chosen, folder, bare, validation=[]).run()
-        errors = {
-            head.name: float(row_l1(model.predict(head), head.weights).mean())
-            for head in held_out
-        }
-        results[key] = {"row_l1_mean": float(np.mean([*errors.values()]))} | errors
-        path.write_text(json.dumps(results, indent=1))
-    for arm in run.arms:
-        key = f"{arm} / {run.labelled} / {run.minutes:g} min / seed "
-        means = [results[key + str(s)]["row_l1_mean"] for s in run.seeds]
-        print(f"{arm:28} {np.mean(means):.4f} +- {np.std(means):.4f}  {means}")
+        order = np.random.default_rng(seed).permutation(len(training))
+        painted, hidden = np.split(order, [run.labelled])
+        painted, hidden = ([training[i] for i in ids] for ids in (painted, hidden))
+        bare = [
+            head.replace(weights=None) for head in [*hidden, *apart(more, held_out)]
+        ]
+        if arm == "all labels":
+            painted, hidden = training, []
+        if arm in ("supervised", "all labels"):
+            bare = []
+        # With one thread the processor's time is the run's.
+        changes = {"minutes": run.minutes, "seed": seed, "threads": 1}
+        config = replace(run.config, **changes, **ARMS[arm])
+        model = ByProcessorTime(config, painted, folder, bare, validation=[]).run()
+        scores = {"arm": arm, "labelled": run.labelled, "minutes": run.minutes}
+        scores |= {"seed": seed, "held_out": errors(model, held_out)}
+        scores |= {"hidden": errors(model, hidden)}
+        (folder / "scores.json").write_text(json.dumps(scores, indent=1))
+    results = collect(run.out)
+    (run.out / "results.json").write_text(json.dumps(results, indent=1) + "\n")
+    for setting, arms in results.items():
+        print(setting)
+        for arm, numbers in arms.items():
+            print(
+                f"  {arm:28}",
+                *(f"{k} {np.mean(v):.4f} {v}" for k, v in numbers.items()),
+            )
+
+
+def errors(model, heads) -> dict[str, float]:
+    """Mean row-L1 of each head."""
+    return {h.name: float(row_l1(model.predict(h), h.weights).mean()) for h in heads}
+
+
+def collect(out: Path) -> dict[str, dict[str, dict[str, list[float]]]]:
+    """{setting: {arm: {kind: mean row-L1 of each seed}}} of all runs that have ended.
+
+    Kinds: `held_out` heads, and `hidden` ones, which the arm may have seen without
+    their weights.
+    """
+    scores = [json.loads(file.read_text()) for file in out.glob("*/scores.json")]
+    scores.sort(
+        key=lambda s: (s["labelled"], s["minutes"], [*ARMS].index(s["arm"]), s["seed"])
+    )
+    results = {}
+    for one in scores:
+        setting = f"{one['labelled']} labelled, {one['minutes']:g} minutes"
+        arm = results.setdefault(setting, {}).setdefault(one["arm"], {})
+        for kind in ("held_out", "hidden"):
+            if one[kind]:
+                mean = round(float(np.mean([*one[kind].values()])), 4)
+                arm.setdefault(kind, []).append(mean)
+    return results
 
 
 if __name__ == "__main__":

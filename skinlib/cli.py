@@ -162,13 +162,15 @@ def train(
 
     For example:
       skinlib train --labelled my_heads --out runs/mine --start heads --minutes 10
+      skinlib train --labelled painted --unlabelled bare --out runs/cast --start heads
       skinlib train --labelled my_heads --out runs/scratch --minutes 30
       skinlib skin new.glb skinned.glb --checkpoint runs/mine
 
     Args:
         labelled: Folder of skinned heads (.glb, .gltf, .npz).
         out: Folder that the network is written to; made when there is none.
-        unlabelled: Folder of heads without weights, to learn shapes from.
+        unlabelled: Folder of heads without weights, best those that you want to skin.
+            Where their mesh is that of a labelled head, its weights are taken over.
         validation: Folder of skinned heads to judge by; else some meshes of LABELLED.
         start: Begin with this network and adapt it, instead of from nothing.
         minutes: How long to train.

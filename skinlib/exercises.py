@@ -556,3 +556,51 @@ def _recent_mean(recent_mean: Callable) -> str | None:
     if empty is None or not np.isnan(empty):
         return "where nothing is known it is NaN"
     return None
+
+
+# ---- 11 semi-supervised training
+
+
+@exercise("11.1")
+def _kinds(kinds: Callable) -> str | None:
+    """`kinds(edges, count)`: (count,) integers, the same where one round is."""
+    path = np.array([[0, 1], [1, 2], [2, 3], [3, 4]])
+    hub = np.array([[5, 6], [6, 7], [7, 8], [7, 9]])
+    found = np.asarray(kinds(np.concatenate([path, hub]), 11))
+    if found.shape != (11,):
+        return f"there are 11 vertices, shape {found.shape} came out"
+    if found[0] != found[4] or found[1] != found[3]:
+        return "a path read backwards has the same kinds: order does not matter"
+    if found[0] == found[1]:
+        return "an end has 1 neighbour, the next vertex 2"
+    if found[1] == found[2]:
+        return "ask the neighbours: one has (1, 2), the other (2, 2)"
+    if found[0] == found[8]:
+        return "of two ends, one hangs on a vertex of 2 neighbours, one on one of 3"
+    if found[2] == found[6]:
+        return "2 + 2 and 1 + 3 are the same sum: keep the numbers, sorted"
+    if found[10] in found[:10]:
+        return "a vertex without an edge is of its own kind"
+    return None
+
+
+@exercise("11.2")
+def _fed(fed: Callable) -> str | None:
+    """`fed(painted, known, weights)`: names of the generator's terms of a draw."""
+    names = "supervised", "adversarial_s", "adversarial_u", "consistency", "physical"
+    weights = dict.fromkeys(names, 0.1)
+    painted, half = set(fed(True, 0, weights)), set(fed(False, 350, weights))
+    if "adversarial_u" in painted:
+        return "a painted head shows D_u what is real: that is the critic's term"
+    if "adversarial_s" in half:
+        return "D_s compares with an artist's rows, all of them: not on a bare head"
+    if "supervised" not in half:
+        return "known rows of a bare head are labels, too"
+    if "supervised" in set(fed(False, 0, weights)):
+        return "of a bare head without known vertices nothing is supervised"
+    shared = {"supervised", "consistency", "physical"}
+    if painted != shared | {"adversarial_s"} or half != shared | {"adversarial_u"}:
+        return "twins and physics speak about every head, each critic about one kind"
+    if set(fed(True, 0, weights | {"physical": 0.0})) != painted - {"physical"}:
+        return "a term of weight 0 is left out"
+    return None

@@ -149,6 +149,23 @@ def felt_slope(gradient):
     return np.sqrt(len(felt) * np.square(felt).sum())
 
 
+def kinds(edges, count, told=sorted):
+    heard = [[] for _ in range(count)]
+    for a, b in edges:
+        heard[a].append(b)
+        heard[b].append(a)
+    seen = [str((len(of), told([len(heard[v]) for v in of]))) for of in heard]
+    return np.unique(seen, return_inverse=True)[1]
+
+
+def fed(painted, known, weights):
+    terms = {"consistency", "physical"}
+    terms.add("adversarial_s" if painted else "adversarial_u")
+    if painted or known:
+        terms.add("supervised")
+    return {name for name in terms if weights[name]}
+
+
 SOLUTIONS = {
     "00.1": right_bone,
     "00.2": keep_largest,
@@ -172,6 +189,8 @@ SOLUTIONS = {
     "09.2": felt_slope,
     "10.1": weights_for,
     "10.2": recent_mean,
+    "11.1": kinds,
+    "11.2": fed,
 }
 WRONG = [
     ("00.1", lambda p, t: len(t) * right_bone(p, t), "divide"),
@@ -329,6 +348,23 @@ WRONG = [
         "take them all",
     ),
     ("10.2", lambda values, count: np.nan_to_num(recent_mean(values, count)), "NaN"),
+    ("11.1", lambda edges, count: kinds(edges, count)[:5], "shape (5,)"),
+    ("11.1", lambda edges, count: np.arange(count), "backwards"),
+    ("11.1", lambda edges, count: np.zeros(count), "an end has 1"),
+    ("11.1", lambda e, n: np.bincount(e.ravel(), minlength=n), "ask the neighbours"),
+    ("11.1", lambda e, n: kinds(e, n, lambda of: sum(x > 1 for x in of)), "two ends"),
+    ("11.1", lambda e, n: kinds(e, n, sum), "same sum"),
+    (
+        "11.1",
+        lambda e, n: np.append(kinds(e, n)[:-1], kinds(e, n)[0]),
+        "of its own kind",
+    ),
+    ("11.2", lambda painted, known, weights: set(weights), "the critic's term"),
+    ("11.2", lambda p, k, weights: fed(p, k, weights) | {"adversarial_s"}, "D_s"),
+    ("11.2", lambda p, k, w: fed(p, 0, w), "labels, too"),
+    ("11.2", lambda p, k, w: fed(p, 1, w), "nothing is supervised"),
+    ("11.2", lambda p, k, w: fed(p, k, w) - {"physical"}, "every head"),
+    ("11.2", lambda p, k, w: fed(p, k, dict.fromkeys(w, 1)), "weight 0"),
 ]
 
 

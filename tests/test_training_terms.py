@@ -15,6 +15,7 @@ from safetensors.torch import load_file
 
 from skinlib import Head
 from skinlib.datasets.augment import AugmentConfig
+from skinlib.datasets.remesh import subdivide
 from skinlib.datasets.synthetic import synthetic_heads
 from skinlib.losses import TermWeights
 from skinlib.model import CriticConfig, ModelConfig
@@ -169,6 +170,17 @@ def test_one_bone_and_other_sizes_in_one_run(heads, bare, tmp_path):
     ones = np.ones((len(heads[0].vertices), 1), np.float32)
     single = Head.create(heads[0].vertices, heads[0].faces, point, ones, name="single")
     run = Trainer(TINY, [single, heads[1]], tmp_path, bare, validation=[])
+    shown = steps(run, 4)
+    assert all(np.isfinite(values).all() for values in shown.values())
+
+
+@pytest.mark.slow
+def test_a_small_and_a_huge_head_in_one_run(heads, tmp_path):
+    huge = heads[1]
+    while len(huge.vertices) < 200_000:
+        huge = subdivide(huge)
+    bare = [heads[2].replace(weights=None), huge.replace(weights=None, name="bare")]
+    run = Trainer(TINY, [heads[0], huge], tmp_path, bare, validation=[])
     shown = steps(run, 4)
     assert all(np.isfinite(values).all() for values in shown.values())
 

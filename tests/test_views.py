@@ -364,6 +364,7 @@ RESULTS = {
             {"train": [1.0, 0.5], "validation": ([1, 2], [1.0, 0.6])},
             targets={"copy": 0.3},
         ),
+        lambda head: plots.training_curves({"critic": [1.0, -0.5]}),
         lambda head: plots.training_curves({"train": [1.0, 0.5]}, log=True),
         lambda head: plots.error_histogram({"ours": np.array([0.0, 0.1, 2.0])}),
         lambda head: plots.method_bars(RESULTS),

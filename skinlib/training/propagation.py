@@ -26,6 +26,8 @@ LOST = 0.01  # weight that may lie on bones which the other skeleton has not
 class Propagation:
     """What painted heads know about the vertices of others.
 
+    Equation `propagation`.
+
     Args:
         painted: heads with weights.
     """

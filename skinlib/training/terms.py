@@ -86,8 +86,7 @@ class Terms:
         mesh = mesh_input(sample.head, sample.graph).to(device)
         skeleton = skeleton_input(sample.head).to(device)
         count = len(sample.graph)
-        judged = rng.choice(count, min(count, config.judged_nodes), replace=False)
-        judged = torch.from_numpy(judged).to(device)
+        judged = torch.from_numpy(self._judged(sample, rng)).to(device)
         target = sample.head.weights[sample.graph.vertex_of_node]
         target = torch.from_numpy(target).to(device)
         # Critics and physics read whole meshes, which a huge one has no memory for.
@@ -117,6 +116,14 @@ class Terms:
         error = row_l1(predicted.detach(), goal).item()
         shown["row_l1" if sample.labelled else "guess_row_l1"] = error
         return Losses(total(terms, config.terms), critics, shown)
+
+    def _judged(self, sample: Sample, rng: np.random.Generator) -> np.ndarray:
+        """Ids of the nodes that are compared with a target: those that have one."""
+        config, count = self.config, len(sample.graph)
+        some = sample.known.any() and not (config.pseudo or config.terms.consistency)
+        places = np.flatnonzero(sample.known) if some else np.arange(count)
+        drawn = min(len(places), config.judged_nodes)
+        return places[rng.choice(len(places), drawn, replace=False)]
 
     def _supervised(self, logits, goal, known) -> Tensor:
         """L_sup, in which a row that nobody painted counts `pseudo`."""

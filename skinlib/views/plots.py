@@ -126,7 +126,7 @@ def training_curves(
                           va="bottom")  # fmt: skip
         if log:
             axes.set_yscale("log")
-        else:
+        elif axes.dataLim.y0 >= 0:
             axes.set_ylim(bottom=0)
         axes.set_xlabel(x_label)
         axes.set_ylabel(y_label)
