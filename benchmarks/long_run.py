@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import tyro
-from rocketbox import split
-from semi_supervised import apart
+from rocketbox import apart, split
 from tyro.conf import Positional
 
 from skinlib.datasets.folder import load_folder

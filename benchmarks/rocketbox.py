@@ -20,7 +20,7 @@ from tyro.conf import Positional
 
 from skinlib.datasets.folder import load_folder
 from skinlib.evaluate.compare import evaluate, format_table
-from skinlib.evaluate.groups import topology_groups
+from skinlib.evaluate.groups import shared_topology, topology_groups
 from skinlib.training import TrainConfig, load_model, train
 
 FOLDS = 4
@@ -37,6 +37,14 @@ def split(heads: list, fold: int) -> tuple[list, list]:
     return [h for h, out in pairs if not out], [h for h, out in pairs if out]
 
 
+def apart(heads: list, held_out: list) -> list:
+    """The heads that share no topology with any of the held-out ones."""
+    if not held_out:
+        return heads
+    similarity = shared_topology([*held_out, *heads])[: len(held_out), len(held_out) :]
+    return [heads[i] for i in np.flatnonzero(similarity.max(axis=0) <= SHARED)]
+
+
 @dataclass(frozen=True)
 class Run:
     """Train on a folder of heads and judge on topology groups that were held out."""
@@ -45,6 +53,7 @@ class Run:
     out: Positional[Path]  # folder for the model and the scores
     fold: Literal["0", "1", "2", "3", "none"] = "0"  # which of the folds is held out
     extra: Path | None = None  # folder of more heads, only to train on
+    unlabelled: Path | None = None  # folder of heads whose weights are not read
     start: str | None = None  # name or folder of a network to begin with
     config: TrainConfig = field(default_factory=TrainConfig)  # every setting
 
@@ -60,11 +69,14 @@ def main(run: Run) -> None:
     extra = load_folder(run.extra) if run.extra else []
     extra = [head for head in extra if head.name not in known]
     extra = [head for head in extra if head.name.split("__")[0] not in hidden]
+    bare = load_folder(run.unlabelled) if run.unlabelled else []
+    bare = [head.replace(weights=None) for head in apart(bare, held_out)]
     # No held-out head chooses the step that is kept: it is the last one.
     model = train(
         run.config,
         labelled + extra,
         run.out / "model",
+        unlabelled=bare,
         validation=[],
         start=load_model(run.start) if run.start else None,
     )

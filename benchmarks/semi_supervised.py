@@ -16,12 +16,11 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from rocketbox import FOLDS, SHARED, split
+from rocketbox import FOLDS, apart, split
 from tqdm import tqdm
 from tyro.conf import Positional
 
 from skinlib.datasets.folder import load_folder
-from skinlib.evaluate.groups import shared_topology
 from skinlib.evaluate.metrics import row_l1
 from skinlib.losses import LossWeights, TermWeights
 from skinlib.training import AS_WRITTEN, SUPERVISED_ONLY, TrainConfig, Trainer
@@ -56,12 +55,6 @@ ARMS = {
     "source, D_u with positives": SOURCE
     | {"forms": replace(AS_WRITTEN, signs="wgan", positives="labelled")},
 }
-
-
-def apart(heads: list, held_out: list) -> list:
-    """The heads that share no topology with any of the held-out ones."""
-    similarity = shared_topology([*held_out, *heads])[: len(held_out), len(held_out) :]
-    return [heads[i] for i in np.flatnonzero(similarity.max(axis=0) <= SHARED)]
 
 
 class ByProcessorTime(Trainer):

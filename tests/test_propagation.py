@@ -142,6 +142,7 @@ def test_only_known_rows_of_unlabelled_heads_are_learnt(painted, sculpted, tmp_p
     # Of the second one nothing is known, so it is not drawn.
     known = trainer.carried[0][1]
     assert trainer.useful == [0]
+    assert trainer.describe_unlabelled().startswith("1 of 2 unlabelled heads share ")
     for draw in range(3):
         head, graph, labelled, mask = trainer._draw(draw, np.random.default_rng(draw))
         assert not labelled and head.name == sculpted.name
@@ -155,9 +156,11 @@ def test_without_propagation_nothing_is_known(painted, sculpted, tmp_path):
     config = replace(CONFIG_OF_TESTS, propagate=False, unlabelled_share=1.0)
     trainer = Trainer(config, [painted], tmp_path / "a", bare, validation=[])
     assert trainer.useful == [] and not trainer.mixed
+    assert "nothing else" in trainer.describe_unlabelled()
     config = replace(config, pseudo=1.0)
     trainer = Trainer(config, [painted], tmp_path / "b", bare, validation=[])
     assert trainer.useful == [0] and trainer.mixed
+    assert trainer.describe_unlabelled() == ""
     assert not trainer._draw(0, np.random.default_rng(0))[3].any()
 
 

@@ -140,8 +140,8 @@ class Trainer:
     def run(self) -> SkinningModel:
         """Train to the end of the budget and return the best model."""
         self.out.mkdir(parents=True, exist_ok=True)
-        if self.unlabelled and parallel.is_first():
-            tqdm.write(self.describe_unlabelled())
+        if (words := self.describe_unlabelled()) and parallel.is_first():
+            tqdm.write(words)
         saved = time.monotonic()
         with self._bar() as bar, ThreadPoolExecutor(self.config.threads) as pool:
             self._pool = pool
@@ -233,12 +233,19 @@ class Trainer:
         return [i for i, (_, known) in enumerate(self.carried) if known.any()]
 
     def describe_unlabelled(self) -> str:
-        """What is learnt from the unlabelled heads, in words."""
+        """What the labelled heads know about the unlabelled ones, in words."""
         known = [mask.mean() for _, mask in self.carried if mask.any()]
-        words = f"{len(known)} of {len(self.carried)} unlabelled heads"
         if known:
-            words += f" share {np.mean(known):.0%} of their vertices"
-        return f"{words} with a labelled head, sculpted anew; all lend proportions."
+            return (
+                f"{len(known)} of {len(self.carried)} unlabelled heads share "
+                f"{np.mean(known):.0%} of their vertices with labelled ones."
+            )
+        if self.carried and not self.useful:
+            return (
+                "No unlabelled head shares vertices with a labelled one: they lend "
+                "their proportions and nothing else."
+            )
+        return ""
 
     def _update(self) -> None:
         """Follow the gradients; the averaged parameters follow slowly."""
