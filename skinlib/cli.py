@@ -34,6 +34,7 @@ def skin(
     target: Output,
     *,
     checkpoint: Checkpoint = DEFAULT_CHECKPOINT,
+    painted: OptionalFolder = None,
     max_influences: Annotated[int | None, arg(metavar="N")] = None,
     lock: Annotated[tuple[str, ...], arg(metavar="BONE ...")] = (),
     symmetric: bool = False,
@@ -49,18 +50,23 @@ def skin(
       skinlib skin head.glb skinned.glb
       skinlib skin head.glb game.glb --max-influences 4 --symmetric
       skinlib skin painted.glb new.glb --lock jaw tongue
+      skinlib skin guard.glb skinned.glb --painted cast
 
     Args:
         source: The head to skin.
         target: Where the skinned head goes; replaced when it exists.
         checkpoint: A shipped network, or a folder that `skinlib train` wrote.
+        painted: Folder of skinned heads. Where IN has their mesh, sculpted anew, it
+            takes over their weights; the network skins the rest.
         max_influences: At most N bones a vertex; all that matter when left out.
         lock: Bones whose weights in IN stay exactly as they are painted.
         symmetric: Same weights on the left and on the right, where the mesh has both.
     """
+    from skinlib.datasets.folder import load_folder
     from skinlib.gltf import MAX_ELEMENTS
     from skinlib.io import check_target, read_head, write_head
     from skinlib.training import load_model
+    from skinlib.training.propagation import Propagation
 
     check_target(target)
     head = read_head(source, weights=bool(lock))
@@ -77,13 +83,19 @@ def skin(
         raise HeadError(
             "--max-influences", f"{max_influences}", "give 1 or more", source
         )
-    weights = load_model(checkpoint).predict(head)
+    weights, note = load_model(checkpoint).predict(head), ""
+    if painted:
+        rows, known = Propagation(load_folder(painted)).rows(head)
+        weights = np.where(known[:, None], rows, weights)
+        note = f"\n{known.mean():.0%} of the vertices are as in {painted}"
     weights = finish(head, weights, locked, symmetric, max_influences)
     both_glb = source.suffix.lower() == target.suffix.lower() == ".glb"
     skinned = head.replace(weights=weights)
     write_head(target, skinned, source=source if both_glb else None)
     used = int((weights > 0).sum(axis=1).max())
-    print(f"{target}: {count:,} vertices, {bones:,} bones, at most {used} a vertex")
+    print(
+        f"{target}: {count:,} vertices, {bones:,} bones, at most {used} a vertex{note}"
+    )
 
 
 def finish(

@@ -32,6 +32,7 @@ def place(tmp_path_factory):
     write_head(folder / "skinned.glb", heads[0])
     write_head(folder / "bare.npz", heads[0].replace(weights=None))
     (folder / "bare").mkdir()
+    (folder / "alone").mkdir()
     write_head(folder / "bare" / "head.npz", heads[0].replace(weights=None))
     save_model(SkinningModel(SMALL), folder / "network", {})
     return folder
@@ -63,7 +64,7 @@ def skin(run, *args) -> np.ndarray:
 @pytest.mark.parametrize(
     "command, words",
     [
-        ("skin", "IN OUT --checkpoint --max-influences --lock --symmetric skinned.glb"),
+        ("skin", "IN OUT --checkpoint --painted --max-influences --lock --symmetric"),
         ("train", "--labelled --unlabelled --out --minutes --seed --device --start"),
         ("evaluate", "--heads --train-heads --checkpoint --json row-L1"),
         ("lab", "--port --no-browser Ctrl-C"),
@@ -151,6 +152,20 @@ def test_symmetric(run):
     predicted = load_model("network").predict(head)
     weights = skin(run, "bare.npz", "out.npz", "--symmetric")
     np.testing.assert_allclose(weights, symmetrize(head, predicted), atol=1e-6)
+
+
+def test_painted_heads_lend_their_weights(run, capsys):
+    # The first of the three painted heads is the bare one.
+    weights = skin(run, "bare.npz", "out.npz", "--painted", "heads")
+    expected = read_head("heads/head_0.npz").weights
+    same = np.abs(weights - expected).sum(axis=1) < 1e-5
+    assert same.mean() > 0.9
+    assert "of the vertices are as in heads" in capsys.readouterr().out
+    write_head("alone/head_2.npz", read_head("heads/head_2.npz"))
+    weights = skin(run, "bare.npz", "out.npz", "--painted", "alone")
+    predicted = load_model("network").predict(read_head("bare.npz"))
+    np.testing.assert_allclose(weights, predicted, atol=1e-6)
+    assert "\n0% of the vertices are as in alone" in capsys.readouterr().out
 
 
 def test_locked_bones_keep_their_weights(run):
@@ -252,6 +267,8 @@ def test_evaluate_writes_the_table_and_the_numbers(run, capsys):
         ("skin no.glb out.glb", "no.glb: file"),
         ("skin bare.npz out.fbx", "out.fbx"),
         ("skin bare.npz out.npz --checkpoint no/where", "no/where"),
+        ("skin bare.npz out.npz --checkpoint network --painted bare", "has none"),
+        ("skin bare.npz out.npz --checkpoint network --painted no", "no: folder"),
         ("skin bare.npz out.npz --max-influences 0", "--max-influences"),
         ("skin bare.npz out.npz --lock mouth_of_truth", "mouth_of_truth"),
         ("skin bare.npz out.npz --lock head", "no weights that could be kept"),

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from skinlib.geometry import neighbourhood_kinds
-from skinlib.head import Head
+from skinlib.head import Head, HeadError
 from skinlib.model.inputs import bone_frame
 
 RINGS = (4, 3, 2)  # how far two meshes have to agree around a vertex; the deepest wins
@@ -30,10 +30,17 @@ class Propagation:
 
     Args:
         painted: heads with weights.
+
+    Raises:
+        HeadError: one of them has none.
     """
 
     def __init__(self, painted: Sequence[Head]):
         self.painted = list(painted)
+        for head in self.painted:
+            if head.weights is None:
+                fix = "take over weights from skinned heads"
+                raise HeadError("weights", f"head {head.name!r} has none", fix)
         sizes = [len(head.vertices) for head in self.painted]
         self._head = np.repeat(np.arange(len(sizes)), sizes)
         self._vertex = np.concatenate([np.arange(size) for size in sizes])
