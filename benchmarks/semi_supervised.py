@@ -44,7 +44,6 @@ ARMS = {
     "propagation": {},
     "all labels": {},
     "proportions": {"propagate": False},
-    "propagation and guesses": {"pseudo": 0.5},
     "pseudo-labels": GUESSED | {"pseudo": 1.0},
     "consistency": GUESSED | {"terms": only(consistency=0.5)},
     "physical": GUESSED | {"terms": only(physical=0.001)},
