@@ -47,14 +47,12 @@ bench: $(VENV)/installed
 clean:
 	rm -rf $(VENV) demo
 
-# Older releases of pip search for hours where this one takes what constraints.txt says.
 # torch goes first: asked for by its exact version, a CPU build on your disk or your
 # index is taken, where a range would let pip prefer a newer and much larger one.
 $(VENV)/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "skinlib needs Python 3.11 or newer: make PYTHON=python3.12 ..."; exit 1; }
 	test -x $(bin)/pip || $(PYTHON) -m venv $(VENV)
-	$(bin)/python -m pip install 'pip>=23.2'
 	$(bin)/python -m pip install "$$(grep '^torch==' constraints.txt)" -c constraints.txt
 	$(bin)/python -m pip install -e '.[dev]' -c constraints.txt
 	touch $@

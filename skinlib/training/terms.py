@@ -1,6 +1,6 @@
 """What one head adds to a step: the terms of the loss, of generator and of critics."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,6 +62,25 @@ class Losses:
     generator: Tensor
     critics: Tensor | None
     shown: dict[str, float]
+
+
+def above_even(critic: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+    """A critic of one head, whose score counts from that of even rows, 1 / J each.
+
+    D_u compares skins of different heads. Its slope in the weights is bounded by the
+    penalty, but what it says of a head by itself is not: it would raise the score of
+    every labelled mesh and lower that of every other one, without end.
+    """
+
+    def judge(weights: Tensor) -> Tensor:
+        return critic(weights) - critic(even(weights))
+
+    return judge
+
+
+def even(weights: Tensor) -> Tensor:
+    """(V, J) rows that give every bone the same."""
+    return torch.full_like(weights, 1 / weights.shape[1])
 
 
 class Terms:
@@ -141,9 +160,10 @@ class Terms:
             score = self.critics[D_S](mesh, skeleton, predicted)
             terms[D_S] = generator_loss(score)
         if not sample.labelled and D_U in self.critics:
-            score = self.critics[D_U](mesh, skeleton, predicted)
+            critic = self.critics[D_U].on(mesh, skeleton)
             as_written = self.config.forms.positives == "none"
-            terms[D_U] = unsupervised_generator_loss(score, as_written)
+            critic = critic if as_written else above_even(critic)
+            terms[D_U] = unsupervised_generator_loss(critic(predicted), as_written)
         if self.config.terms.physical:
             faces = sample.graph.node_of_vertex[sample.head.faces]
             points = sample.head.vertices[sample.graph.vertex_of_node]
@@ -200,6 +220,7 @@ class Terms:
             if forms.positives == "labelled":
                 # One part of the draws brings the real scores, the other the fake
                 # ones: divided by their shares, so that a constant cancels.
+                critic = above_even(critic)
                 if sample.labelled:
                     real = score(D_U, "real", critic(target))
                     losses.append(-real / (1 - share))
@@ -207,4 +228,7 @@ class Terms:
                 else:
                     made = score(D_U, "fake", critic(fake))
                     losses.append(made / share)
+                    losses.append(
+                        penalty(critic, torch.full_like(fake, 1 / fake.shape[1]))
+                    )
         return (torch.stack(losses).sum() if losses else None), scores
