@@ -276,6 +276,7 @@ class Trainer:
         head = augment(head, rng, changes, others)
         if not changes.keeps_mesh:
             graph = build_graph(head, self.model.config.graph)
+            known = np.ones(len(graph), bool)
         mix = float(rng.random())
         sample = Sample(head, graph, labelled, known, self.mixed, mix)
         losses = self.terms.losses(sample, rng)
