@@ -67,9 +67,9 @@ class Losses:
 def above_even(critic: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
     """A critic of one head, whose score counts from that of even rows, 1 / J each.
 
-    Equation `adv_u`. D_u compares skins of different heads. Its slope in the weights is bounded by the
-    penalty, but what it says of a head by itself is not: it would raise the score of
-    every labelled mesh and lower that of every other one, without end.
+    Equation `adv_u`. D_u compares skins of different heads. Its slope in the weights is
+    bounded by the penalty, but what it says of a head by itself is not: it would raise
+    the score of every labelled mesh and lower that of every other one, without end.
     """
 
     def judge(weights: Tensor) -> Tensor:
