@@ -37,6 +37,8 @@ def skin(
     painted: OptionalFolder = None,
     max_influences: Annotated[int | None, arg(metavar="N")] = None,
     lock: Annotated[tuple[str, ...], arg(metavar="BONE ...")] = (),
+    lock_vertices: Annotated[str | None, arg(metavar="ATTRIBUTE")] = None,
+    smooth: Annotated[int, arg(metavar="N")] = 0,
     symmetric: bool = False,
 ) -> None:
     """Compute skin weights for a head.
@@ -50,6 +52,7 @@ def skin(
       skinlib skin head.glb skinned.glb
       skinlib skin head.glb game.glb --max-influences 4 --symmetric
       skinlib skin painted.glb new.glb --lock jaw tongue
+      skinlib skin painted.glb new.glb --lock-vertices _LOCKED --smooth 2
       skinlib skin guard.glb skinned.glb --painted cast
 
     Args:
@@ -60,16 +63,22 @@ def skin(
             takes over their weights; the network skins the rest.
         max_influences: At most N bones a vertex; all that matter when left out.
         lock: Bones whose weights in IN stay exactly as they are painted.
-        symmetric: Same weights on the left and on the right, where the mesh has both.
+        lock_vertices: So do the vertices where this attribute of IN is above 0.5, such
+            as _LOCKED from Blender, or the field `locked` of a .npz.
+        smooth: Smooth N times along the surface, never from lip to lip, and prune. It
+            calms noise, and blurs what is painted well.
+        symmetric: Same weights on the left and on the right, where the mesh has both;
+            where one side is locked, the other follows it.
     """
     from skinlib.datasets.folder import load_folder
     from skinlib.gltf import MAX_ELEMENTS
-    from skinlib.io import check_target, read_head, write_head
+    from skinlib.io import check_target, read_head, read_vertex_mask, write_head
+    from skinlib.painting import finish
     from skinlib.training import load_model
     from skinlib.training.propagation import Propagation
 
     check_target(target)
-    head = read_head(source, weights=bool(lock))
+    head = read_head(source, weights=bool(lock or lock_vertices))
     count, bones = len(head.vertices), len(head.skeleton)
     if count * bones > MAX_ELEMENTS:
         raise HeadError(
@@ -78,17 +87,36 @@ def skin(
             f"stay below {MAX_ELEMENTS:,} weights: export the head alone",
             source,
         )
-    locked = _locked_bones(head, lock, source)
+    bone_ids = _locked_bones(head, lock, source)
+    vertices = read_vertex_mask(source, lock_vertices) if lock_vertices else None
+    if (lock or lock_vertices) and head.weights is None:
+        raise HeadError(
+            "--lock" if lock else "--lock-vertices",
+            "the head has no weights that could be kept",
+            "lock bones and vertices of a head that is skinned already",
+            source,
+        )
     if max_influences is not None and max_influences < 1:
         raise HeadError(
             "--max-influences", f"{max_influences}", "give 1 or more", source
         )
+    if smooth < 0:
+        raise HeadError("--smooth", f"{smooth}", "give 0 or more", source)
     weights, note = load_model(checkpoint).predict(head), ""
     if painted:
         rows, known = Propagation(load_folder(painted)).rows(head)
         weights = np.where(known[:, None], rows, weights)
         note = f"\n{known.mean():.0%} of the vertices are as in {painted}"
-    weights = finish(head, weights, locked, symmetric, max_influences)
+    weights = finish(
+        head,
+        weights,
+        locked_bones=bone_ids,
+        locked_vertices=vertices,
+        smooth=smooth,
+        symmetric=symmetric,
+        max_influences=max_influences,
+        file=source,
+    )
     both_glb = source.suffix.lower() == target.suffix.lower() == ".glb"
     skinned = head.replace(weights=weights)
     write_head(target, skinned, source=source if both_glb else None)
@@ -98,43 +126,6 @@ def skin(
     )
 
 
-def finish(
-    head: Head,
-    weights: np.ndarray,
-    locked: Sequence[int] = (),
-    symmetric: bool = False,
-    max_influences: int | None = None,
-) -> np.ndarray:
-    """(V, J) predicted weights made symmetric, limited, and with locked bones put back.
-
-    Locked bones take their influences first and the predicted ones share the rest.
-
-    Raises:
-        HeadError: a vertex needs more influences for its locked bones alone.
-    """
-    from skinlib.skinning import limit_influences, lock_bones, symmetrize
-
-    if symmetric:
-        weights = symmetrize(head, weights)
-    if max_influences is not None:
-        rank = np.array(weights)
-        if len(locked):
-            rank[:, locked] = 2 * (head.weights[:, locked] > 0)
-        kept = limit_influences(rank, max_influences) > 0
-        weights = np.where(kept, weights, 0)
-        weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
-    if len(locked):
-        weights = lock_bones(weights, head.weights, locked)
-    over = (weights > 0).sum(axis=1).max()
-    if max_influences is not None and over > max_influences:
-        raise HeadError(
-            "--max-influences",
-            f"the locked bones leave vertices with {over} influences",
-            f"allow {over}, or lock fewer bones",
-        )
-    return weights
-
-
 def _locked_bones(head: Head, names: Sequence[str], file: Path) -> list[int]:
     unknown = [name for name in names if name not in head.skeleton.names]
     if unknown:
@@ -142,13 +133,6 @@ def _locked_bones(head: Head, names: Sequence[str], file: Path) -> list[int]:
             "--lock",
             f"no bone is called {', '.join(map(repr, unknown))}",
             f"choose from {', '.join(head.skeleton.names)}",
-            file,
-        )
-    if names and head.weights is None:
-        raise HeadError(
-            "--lock",
-            "the head has no weights that could be kept",
-            "lock bones of a head that is skinned already",
             file,
         )
     return [head.skeleton.names.index(name) for name in names]

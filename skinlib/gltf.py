@@ -16,6 +16,7 @@ import struct
 import urllib.parse
 import warnings
 from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -31,12 +32,52 @@ MAX_ELEMENTS = 2**28
 claim any size; what claims more than this is refused before memory is taken for it."""
 
 EXTRAS_KEY = "skinlib"
+OUR_COLOURS = "skinlib colours"
+"""The name of the accessors with colours that we wrote and may write again."""
 
 
 def read(path: Path, weights: bool = True) -> Head:
     """Read a head; see `skinlib.io.read_glb`."""
     document = _Document(path)
     return _head_from(document, _Binding(document), weights)
+
+
+def read_attribute(path: Path, name: str) -> np.ndarray:
+    """(V,) values of a custom attribute; 0 on the parts of the head that lack it."""
+    document = _Document(path)
+    blocks = _Binding(document).blocks
+    parts, there = [], set()
+    for block in blocks:
+        custom = [key for key in block.attributes if key.startswith("_")]
+        there.update(custom)
+        count = len(document.array(block.attributes["POSITION"], "POSITION", "VEC3"))
+        values = np.zeros(count, np.float32)
+        for key in custom:
+            if plain_name(key) == plain_name(name):
+                values = document.array(block.attributes[key], key, "SCALAR")
+        if len(values) != count:
+            document.fail(
+                name, f"{len(values)} values for {count} vertices", "export it again"
+            )
+        parts.append(values)
+    fix = (
+        "export it (in Blender: tick Data > Mesh > Attributes; its name begins with _)"
+    )
+    check_attribute(name, there, fix, path)
+    return np.concatenate(parts)
+
+
+def plain_name(name: str) -> str:
+    """`_LOCKED`, as glTF wants it, and `locked`, as a .npz has it, are one name."""
+    return name.lower().lstrip("_")
+
+
+def check_attribute(name: str, there: Iterable[str], fix: str, path: Path) -> None:
+    """Raise a HeadError that names the attributes `there` when `name` is not one."""
+    if plain_name(name) not in map(plain_name, there):
+        others = f"only {', '.join(sorted(there))}" if there else "nor any other"
+        found = f"there is no such attribute of the vertices, {others}"
+        raise HeadError(name, found, f"name one that is there, or {fix}", path)
 
 
 # pygltflib leaves out two properties of the specification, which would be lost when a
@@ -641,8 +682,13 @@ def _kept_bone(extras, joint: np.ndarray):
     return (head, length, direction) if fresh and sound else None
 
 
-def new_file(head: Head, max_influences: int | None) -> bytes:
-    """A .glb file with the head and nothing else."""
+def new_file(
+    head: Head,
+    max_influences: int | None,
+    colours: np.ndarray | None = None,
+    attributes: Mapping[str, np.ndarray] | None = None,
+) -> bytes:
+    """A .glb file with the head and nothing else; see `skinlib.io.write_head`."""
     document = _Document()
     tree, skeleton = document.tree, head.skeleton
     joints = skeleton.joints.astype(np.float64)
@@ -678,14 +724,16 @@ def new_file(head: Head, max_influences: int | None) -> bytes:
     tree.scenes = [pygltflib.Scene(nodes=[len(skeleton), len(skeleton) + 1])]
     tree.scene = 0
 
-    attributes = pygltflib.Attributes(
-        POSITION=document.add(head.vertices, "VEC3", pygltflib.ARRAY_BUFFER),
-        NORMAL=document.add(head.normals, "VEC3", pygltflib.ARRAY_BUFFER),
-    )
-    positions = tree.accessors[attributes.POSITION]
+    sets = {
+        "POSITION": document.add(head.vertices, "VEC3", pygltflib.ARRAY_BUFFER),
+        "NORMAL": document.add(head.normals, "VEC3", pygltflib.ARRAY_BUFFER),
+    }
+    positions = tree.accessors[sets["POSITION"]]
     positions.min = head.vertices.min(axis=0).tolist()
     positions.max = head.vertices.max(axis=0).tolist()
-    primitive = pygltflib.Primitive(attributes=attributes, mode=pygltflib.POINTS)
+    primitive = pygltflib.Primitive(
+        attributes=pygltflib.Attributes(**sets), mode=pygltflib.POINTS
+    )
     if len(head.faces):
         # The largest id of a type is reserved, it restarts a primitive.
         dtype = np.uint16 if len(head.vertices) <= 65535 else np.uint32
@@ -696,12 +744,21 @@ def new_file(head: Head, max_influences: int | None) -> bytes:
     if head.weights is not None:
         tree.nodes[-1].skin = 0
         bones, values = sorted_influences(head.weights, max_influences)
-        vars(attributes).update(_add_influences(document, bones, values, len(skeleton)))
+        influences = _add_influences(document, bones, values, len(skeleton))
+        vars(primitive.attributes).update(influences)
+    _add_attributes(document, [_Block(sets, [primitive])], colours, attributes or {})
     return document.to_bytes()
 
 
-def reskinned(source: Path, head: Head, max_influences: int | None) -> bytes:
+def reskinned(
+    source: Path,
+    head: Head,
+    max_influences: int | None,
+    colours: np.ndarray | None = None,
+    attributes: Mapping[str, np.ndarray] | None = None,
+) -> bytes:
     """The source file with the weights of `head` on its mesh."""
+    attributes = attributes or {}
     if source.suffix.lower() != ".glb":
         raise HeadError(
             "file",
@@ -717,25 +774,34 @@ def reskinned(source: Path, head: Head, max_influences: int | None) -> bytes:
     _one_buffer(document)
     if not binding.skinned:
         _bind(document, binding)
-    document.recycle(_without_influences(binding))
+    document.recycle(_without_old(document, binding, colours is not None, attributes))
     bones, values = sorted_influences(head.weights[:, columns], max_influences)
     start = 0
     for block in binding.blocks:
         count = document.tree.accessors[block.attributes["POSITION"]].count
         part = slice(start, start + count)
-        attributes = _add_influences(document, bones[part], values[part], len(columns))
+        influences = _add_influences(document, bones[part], values[part], len(columns))
         for primitive in block.primitives:
-            vars(primitive.attributes).update(attributes)
+            vars(primitive.attributes).update(influences)
         start += count
+    _add_attributes(document, binding.blocks, colours, attributes)
     return document.to_bytes()
 
 
-def _without_influences(binding: _Binding) -> set[int]:
-    """Take JOINTS_n and WEIGHTS_n off the head; returns the accessors they had."""
+def _without_old(
+    document: _Document, binding: _Binding, colours: bool, replaced: Iterable[str]
+) -> set[int]:
+    """Take off the head what will be written anew; returns the accessors it had."""
     accessors = set()
+    replaced = set(map(plain_name, replaced))
     for block in binding.blocks:
-        for name in list(block.attributes):
-            if name.startswith(("JOINTS_", "WEIGHTS_")):
+        for name, accessor_id in list(block.attributes.items()):
+            ours = document.tree.accessors[accessor_id].name == OUR_COLOURS
+            if (
+                name.startswith(("JOINTS_", "WEIGHTS_"))
+                or (name.startswith("_") and plain_name(name) in replaced)
+                or (name.startswith("COLOR_") and ours and colours)
+            ):
                 accessors.add(block.attributes.pop(name))
                 for primitive in block.primitives:
                     delattr(primitive.attributes, name)
@@ -832,9 +898,9 @@ def sorted_influences(
     padded_bones, padded_values = np.zeros(shape, np.int64), np.zeros(shape)
     padded_bones[rows[kept], ranks[kept]] = bones[kept]
     padded_values[rows[kept], ranks[kept]] = values[kept]
-    # Rows that sum to 1 within float32 stay as they are, to the bit.
+    # Rows that sum to 1 as those of a head do stay as they are, to the bit.
     sums = padded_values.sum(axis=1)
-    off = np.abs(sums - 1) > 2e-7
+    off = np.abs(sums - 1) > 1e-6
     padded_values[off] /= sums[off, None]
     return padded_bones, padded_values.astype(np.float32)
 
@@ -854,3 +920,37 @@ def _add_influences(
             accessor = document.add(array[:, part], "VEC4", pygltflib.ARRAY_BUFFER)
             attributes[f"{name}_{i}"] = accessor
     return attributes
+
+
+def _add_attributes(
+    document: _Document,
+    blocks: list[_Block],
+    colours: np.ndarray | None,
+    attributes: Mapping[str, np.ndarray],
+) -> None:
+    """Put colours (V, 4) uint8 and custom attributes (V,) float32 on the head's parts.
+
+    The colours come after those that the file has: COLOR_0 is what every viewer
+    shows, and may be the artist's.
+    """
+    taken = max(sum(name.startswith("COLOR_") for name in b.attributes) for b in blocks)
+    start = 0
+    for block in blocks:
+        count = document.tree.accessors[block.attributes["POSITION"]].count
+        part = slice(start, start + count)
+        start += count
+        added = {
+            name: document.add(values[part], "SCALAR", pygltflib.ARRAY_BUFFER)
+            for name, values in attributes.items()
+        }
+        for i in range(0 if colours is None else taken + 1):
+            if f"COLOR_{i}" not in block.attributes:
+                # White leaves a part as it is that has fewer colours than another.
+                values = colours[part] if i == taken else np.full((count, 4), 255, "u1")
+                added[f"COLOR_{i}"] = document.add(
+                    values, "VEC4", pygltflib.ARRAY_BUFFER
+                )
+                accessor = document.tree.accessors[added[f"COLOR_{i}"]]
+                accessor.normalized, accessor.name = True, OUR_COLOURS
+        for primitive in block.primitives:
+            vars(primitive.attributes).update(added)

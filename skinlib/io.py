@@ -7,9 +7,10 @@ read of a glTF file, and how, is told in `skinlib.gltf`.
 import contextlib
 import math
 import os
+import re
 import uuid
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
@@ -29,6 +30,10 @@ NPZ_KEYS = (
     "weights",
 )
 NPZ_OPTIONAL = {"normals", "bone_tails", "weights"}
+COLOURS = "colours"
+
+LOCKED = "_LOCKED"
+"""The attribute that marks vertices whose weights an artist wants to keep."""
 
 
 def read_head(path: str | Path, weights: bool = True) -> Head:
@@ -45,11 +50,40 @@ def read_head(path: str | Path, weights: bool = True) -> Head:
     return _by_suffix(readers, path)(path, weights)
 
 
+def read_vertex_mask(path: str | Path, name: str = LOCKED) -> np.ndarray:
+    """(V,) bool: the vertices that a file marks, in the order of `read_head`.
+
+    A .glb or .gltf has a custom attribute of that name, one number a vertex (Blender
+    writes attributes whose name begins with `_` when Data > Mesh > Attributes is
+    ticked); a .npz has it as a field. Capitals and leading underscores do not count:
+    `_LOCKED` is the field `locked` too.
+
+    Returns:
+        True where the number is above 0.5; False on parts of the mesh that lack it.
+
+    Raises:
+        HeadError: the file cannot be read, or has no such attribute.
+    """
+    readers = {".npz": _npz_attribute, ".glb": gltf.read_attribute}
+    readers[".gltf"] = gltf.read_attribute
+    read, path = _by_suffix(readers, path), _existing_file(path)
+    with _malformed(path, "write or export it again"):
+        values = read(path, name)
+        if not np.isfinite(values).all():
+            vertex = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise HeadError(
+                name, f"vertex {vertex} has NaN or infinity", "export it again", path
+            )
+        return values > 0.5
+
+
 def write_head(
     path: str | Path,
     head: Head,
     source: str | Path | None = None,
     max_influences: int | None = None,
+    colours: np.ndarray | None = None,
+    attributes: Mapping[str, np.ndarray] | None = None,
 ) -> None:
     """Write a head to a `.npz` or `.glb` file; the file appears whole or not at all.
 
@@ -60,15 +94,21 @@ def write_head(
             targets, animations, other meshes, ...) and the weights of `head` are put
             on its mesh. `head` must have its vertices and its bones.
         max_influences: keep this many of a vertex's largest weights; None keeps all.
+        colours: (V, 3) or (V, 4), from 0 to 1, linear RGB or RGBA: COLOR_0 of a `.glb`,
+            or the next COLOR_n where the artist has painted (what was written so
+            before is replaced); the field `colours` of a `.npz`.
+        attributes: (V,) numbers by name, such as `_CONFIDENCE`, which Blender shows
+            under that name; the field `confidence` of a `.npz`.
 
     Raises:
         HeadError: the file cannot be written, or `head` does not fit `source`.
     """
     write = _by_suffix({".npz": write_npz, ".glb": write_glb}, path)
+    options = (max_influences, colours, attributes)
     if source is None:
-        write(path, head, max_influences=max_influences)
+        write(path, head, *options)
     elif write is write_glb:
-        write_glb(path, head, source=source, max_influences=max_influences)
+        write_glb(path, head, *options, source=source)
     else:
         raise HeadError(
             "file",
@@ -191,13 +231,42 @@ def _npz_array(archive: zipfile.ZipFile, key: str, path: Path) -> np.ndarray | N
         return np.lib.format.read_array(file, allow_pickle=False)
 
 
-def write_npz(path: str | Path, head: Head, max_influences: int | None = None) -> None:
+def _npz_attribute(path: Path, name: str) -> np.ndarray:
+    """(V,) values of a field that is none of `NPZ_KEYS`."""
+    with zipfile.ZipFile(path) as archive:
+        fields = {name.removesuffix(".npy") for name in archive.namelist()}
+        fields -= {*NPZ_KEYS, COLOURS}
+        gltf.check_attribute(name, fields, "save it as a field", path)
+        key = next(f for f in fields if gltf.plain_name(f) == gltf.plain_name(name))
+        values = _npz_array(archive, key, path)
+        count = len(_npz_array(archive, "vertices", path))
+    if values.shape != (count,) or values.dtype.kind not in "biuf":
+        raise HeadError(
+            key,
+            f"{values.dtype} values of shape {values.shape} for {count} vertices",
+            "store one number or truth value per vertex",
+            path,
+        )
+    return values
+
+
+def write_npz(
+    path: str | Path,
+    head: Head,
+    max_influences: int | None = None,
+    colours: np.ndarray | None = None,
+    attributes: Mapping[str, np.ndarray] | None = None,
+) -> None:
     """Write a head to a compressed `.npz` file with the arrays `NPZ_KEYS`.
+
+    `colours` is (V, 4) uint8; `attributes` are float32 fields, see `write_head`.
 
     Raises:
         HeadError: the file cannot be written.
     """
     skeleton = head.skeleton
+    colours = _checked_colours(colours, len(head.vertices), path)
+    attributes = _checked_attributes(attributes, len(head.vertices), path)
     arrays = {
         "vertices": head.vertices,
         "faces": head.faces,
@@ -212,6 +281,9 @@ def write_npz(path: str | Path, head: Head, max_influences: int | None = None) -
         weights = np.zeros_like(head.weights)
         np.add.at(weights, (np.arange(len(weights))[:, None], bones), values)
         arrays["weights"] = weights
+    if colours is not None:
+        arrays[COLOURS] = colours
+    arrays |= {gltf.plain_name(name): values for name, values in attributes.items()}
     with atomic(path) as file:
         np.savez_compressed(file, **arrays)
 
@@ -237,8 +309,10 @@ def read_glb(path: str | Path, weights: bool = True) -> Head:
 def write_glb(
     path: str | Path,
     head: Head,
-    source: str | Path | None = None,
     max_influences: int | None = None,
+    colours: np.ndarray | None = None,
+    attributes: Mapping[str, np.ndarray] | None = None,
+    source: str | Path | None = None,
 ) -> None:
     """Write a head to a `.glb` file; see `write_head`.
 
@@ -248,12 +322,14 @@ def write_glb(
         HeadError: the file cannot be written, or `head` does not fit `source`.
     """
     _checked_names(head.skeleton.names, path)
+    colours = _checked_colours(colours, len(head.vertices), path)
+    attributes = _checked_attributes(attributes, len(head.vertices), path)
     if source is None:
-        content = gltf.new_file(head, max_influences)
+        content = gltf.new_file(head, max_influences, colours, attributes)
     else:
         source = _existing_file(source)
         with _malformed(source, "export it again as binary glTF 2.0"):
-            content = gltf.reskinned(source, head, max_influences)
+            content = gltf.reskinned(source, head, max_influences, colours, attributes)
     with atomic(path) as file:
         file.write(content)
 
@@ -329,3 +405,44 @@ def _checked_names(names, path: str | Path) -> list[str]:
                 path,
             )
     return list(names)
+
+
+def _checked_colours(
+    colours: np.ndarray | None, count: int, path: str | Path
+) -> np.ndarray | None:
+    """(V, 4) uint8, opaque where no alpha is given."""
+    if colours is None:
+        return None
+    colours = np.asarray(colours, np.float64)
+    if colours.shape not in ((count, 3), (count, 4)):
+        found = f"an array of shape {colours.shape}"
+    elif not ((colours >= 0) & (colours <= 1)).all():
+        found = f"values from {colours.min():.4g} to {colours.max():.4g}"
+    else:
+        padded = np.ones((count, 4))
+        padded[:, : colours.shape[1]] = colours
+        return np.round(255 * padded).astype(np.uint8)
+    fix = f"give RGB or RGBA from 0 to 1 for each of the {count} vertices"
+    raise HeadError(COLOURS, found, fix, path)
+
+
+def _checked_attributes(
+    attributes: Mapping[str, np.ndarray] | None, count: int, path: str | Path
+) -> dict[str, np.ndarray]:
+    """(V,) float32 by name."""
+    checked = {}
+    for name, values in (attributes or {}).items():
+        values = np.asarray(values)
+        taken = gltf.plain_name(name) in {*NPZ_KEYS, COLOURS}
+        if not re.fullmatch(r"_\w*[^\W_]", name, re.ASCII) or taken:
+            found, fix = "a name that is not free", "name it like _CONFIDENCE"
+        elif values.shape != (count,) or values.dtype.kind not in "biuf":
+            found = f"{values.dtype} values of shape {values.shape}"
+            fix = f"give a number for each of the {count} vertices"
+        elif not np.isfinite(values).all():
+            found, fix = "NaN or infinity", "give finite numbers"
+        else:
+            checked[name] = values.astype(np.float32)
+            continue
+        raise HeadError(name, found, fix, path)
+    return checked

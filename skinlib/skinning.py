@@ -1,4 +1,4 @@
-"""What skin weights are for, and what riggers do to them afterwards.
+"""What skin weights are for: posing a head; and which bones and vertices are which.
 
 Symbols: V vertices, J bones; p_j joint positions, w_vj skin weights, T_j transforms.
 `linear_blend_skinning` and `forward_kinematics` take numpy arrays or torch tensors and
@@ -108,68 +108,6 @@ def forward_kinematics(
     return xp.concatenate([top, bottom], -2)
 
 
-def prune(weights: np.ndarray, threshold: float) -> np.ndarray:
-    """(V, J) weights without those below `threshold`; rows sum to 1 again.
-
-    A row's largest weight always stays.
-
-    >>> prune(np.array([[0.9, 0.0625, 0.0375]]), 0.05).round(4).tolist()
-    [[0.9351, 0.0649, 0.0]]
-    """
-    kept = weights >= np.minimum(threshold, weights.max(axis=1, keepdims=True))
-    return _normalize_rows(np.where(kept, weights, 0))
-
-
-def limit_influences(weights: np.ndarray, count: int) -> np.ndarray:
-    """(V, J) weights with at most `count` bones a vertex; rows sum to 1 again.
-
-    Keeping the largest is the choice that changes a row least (row-L1).
-
-    >>> limit_influences(np.array([[0.5, 0.125, 0.375]]), 2).round(4).tolist()
-    [[0.5714, 0.0, 0.4286]]
-    """
-    if count < 1:
-        raise ValueError(f"at least 1 influence is needed, found {count}")
-    if count >= weights.shape[1]:
-        return weights
-    kept = np.argpartition(-weights, count - 1, axis=1)[:, :count]
-    limited = np.zeros_like(weights)
-    np.put_along_axis(limited, kept, np.take_along_axis(weights, kept, 1), 1)
-    # Rows that were within the limit stay as they are, to the bit.
-    over = (weights > 0).sum(axis=1) > count
-    limited[over] = _normalize_rows(limited[over])
-    return limited
-
-
-def lock_bones(
-    weights: np.ndarray, original: np.ndarray, bone_ids: np.ndarray | list[int]
-) -> np.ndarray:
-    """`weights` with the columns `bone_ids` of `original`, bit by bit.
-
-    The other bones share what the locked ones leave, in their own proportions; where
-    `weights` gives them nothing, in the proportions of `original`.
-
-    Args:
-        weights: (V, J) predicted. original: (V, J) the artist's. bone_ids: locked.
-
-    Returns:
-        (V, J) in the type of `original`, rows >= 0 with sum 1.
-
-    >>> lock_bones(np.array([[0.5, 0.25, 0.25]]), np.array([[0.25, 0.5, 0.25]]), [0])
-    array([[0.25 , 0.375, 0.375]])
-    """
-    locked = np.zeros(original.shape[1], bool)
-    locked[np.asarray(bone_ids, np.int64)] = True
-    free = np.where(locked, 0, np.asarray(weights, np.float64))
-    empty = free.sum(axis=1) <= 0
-    free[empty] = np.where(locked, 0, original[empty])
-    left = np.clip(1 - original[:, locked].sum(axis=1, dtype=np.float64), 0, None)
-    share = left / np.maximum(free.sum(axis=1), np.finfo(np.float64).tiny)
-    result = (free * share[:, None]).astype(original.dtype)
-    result[:, locked] = original[:, locked]
-    return result
-
-
 def mirror_pairs(skeleton: Skeleton) -> np.ndarray:
     """(J,) the bone on the other side of each bone; itself for one in the middle.
 
@@ -185,24 +123,13 @@ def mirror_pairs(skeleton: Skeleton) -> np.ndarray:
     return _mirror(skeleton)[2]
 
 
-def symmetrize(head: Head, weights: np.ndarray) -> np.ndarray:
-    """(V, J) weights averaged with those of the mirrored vertex, sides exchanged.
-
-    A vertex's partner is the nearest one to its mirror image, within 1 % of the box's
-    diagonal, on the same piece of the surface or on that piece's mirror image, and with
-    a normal that agrees, so that upper lip and lower lip are never mixed. Vertices
-    without a partner keep their weights.
-    """
-    partner = mirror_vertices(head)
-    pairs = mirror_pairs(head.skeleton)
-    found = partner >= 0
-    result = np.array(weights)
-    result[found] = (weights[found] + weights[partner[found]][:, pairs]) / 2
-    return result
-
-
 def mirror_vertices(head: Head) -> np.ndarray:
-    """(V,) the vertex at each one's mirror image, as in `symmetrize`; -1 for none."""
+    """(V,) the vertex at each one's mirror image; -1 for none.
+
+    The nearest one to it, within 1 % of the box's diagonal, on the same piece of the
+    surface or on that piece's mirror image, and with a normal that agrees, so that
+    upper lip and lower lip are never mixed.
+    """
     axis, plane, _ = _mirror(head.skeleton)
     flip = np.ones(3)
     flip[axis] = -1
@@ -431,8 +358,3 @@ _SWAP |= {b: a for a, b in _SWAP.items()}
 def _other_side(name: str) -> str:
     """`LEyeBlinkTop` -> `REyeBlinkTop`, `eye.L` -> `eye.R`, `jaw` -> `jaw`."""
     return _SIDE.sub(lambda side: _SWAP[side.group()], name)
-
-
-def _normalize_rows(weights: np.ndarray) -> np.ndarray:
-    total = weights.sum(axis=1, keepdims=True, dtype=np.float64)
-    return (weights / np.where(total > 0, total, 1)).astype(weights.dtype)

@@ -75,3 +75,13 @@ def moved(head: Head, rotation=None, scale: float = 1.0, shift=(0, 0, 0)) -> Hea
         normals=head.normals @ rotation.T,
         name=head.name,
     )
+
+
+def mirrored_square():
+    """Two vertices left, two right, two in the middle; a bone on each side."""
+    skeleton = Skeleton.from_heads_and_tails(
+        [[0, 0, 0], [1, 1, 0], [-1, 1, 0]], None, [-1, 0, 0], ["head", "a", "b"]
+    )
+    vertices = [[1, 0, 0], [0, 0, 0], [-1, 0, 0], [1, 1, 0], [0, 1, 0], [-1, 1, 0]]
+    faces = [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]]
+    return Head.create(vertices, faces, skeleton)

@@ -12,10 +12,9 @@ import pytest
 
 from skinlib import check, cli, demo, gltf
 from skinlib.datasets.synthetic import synthetic_heads
-from skinlib.head import Head, HeadError, Skeleton
 from skinlib.io import read_head, write_head
 from skinlib.model import ModelConfig, SkinningModel
-from skinlib.skinning import symmetrize
+from skinlib.painting import limit_influences, prune, smooth_weights, symmetrize
 from skinlib.training import TrainConfig, load_model, save_model
 
 SMALL = ModelConfig(mesh_width=8, bone_width=8, blocks=1, points=2, tree_layers=1)
@@ -34,6 +33,9 @@ def place(tmp_path_factory):
     (folder / "bare").mkdir()
     (folder / "alone").mkdir()
     write_head(folder / "bare" / "head.npz", heads[0].replace(weights=None))
+    marks = {"attributes": {"_LOCKED": np.ones(len(heads[0].vertices))}}
+    write_head(folder / "full.npz", heads[0], **marks)
+    write_head(folder / "marked.npz", heads[0].replace(weights=None), **marks)
     save_model(SkinningModel(SMALL), folder / "network", {})
     return folder
 
@@ -65,6 +67,7 @@ def skin(run, *args) -> np.ndarray:
     "command, words",
     [
         ("skin", "IN OUT --checkpoint --painted --max-influences --lock --symmetric"),
+        ("skin", "--lock-vertices ATTRIBUTE _LOCKED --smooth"),
         ("train", "--labelled --unlabelled --out --minutes --seed --device --start"),
         ("evaluate", "--heads --train-heads --checkpoint --json row-L1"),
         ("lab", "--port --no-browser Ctrl-C"),
@@ -176,29 +179,38 @@ def test_locked_bones_keep_their_weights(run):
     assert not np.array_equal(weights, head.weights)
 
 
-@pytest.fixture
-def corner():
-    """A triangle on four bones; the artist used the first two."""
-    bones = Skeleton.from_heads_and_tails(np.eye(4, 3), None, [-1, 0, 0, 0], "abcd")
-    painted = np.tile([0.25, 0.5, 0.25, 0], (3, 1))
-    return Head.create(np.eye(3), [[0, 1, 2]], bones, painted)
+@pytest.mark.parametrize("suffix", ["npz", "glb"])
+def test_locks_are_kept_to_the_bit_whatever_else_is_asked(run, place, suffix):
+    head = read_head(place / "heads" / "head_0.npz")
+    head = head.replace(weights=limit_influences(head.weights, 3))
+    rng = np.random.default_rng(0)
+    locked = rng.random(len(head.vertices)) < 0.2
+    extras = {"attributes": {"_LOCKED": locked, "_OTHER": ~locked}}
+    write_head(place / f"painted.{suffix}", head, **extras)
+    painted = read_head(place / f"painted.{suffix}").weights
+    weights = skin(
+        *(run, f"painted.{suffix}", f"kept.{suffix}", "--lock", "jaw"),
+        *("--lock-vertices", "_LOCKED", "--symmetric", "--max-influences", 4),
+        *("--smooth", 2),
+    )
+    jaw = head.skeleton.names.index("jaw")
+    assert np.array_equal(weights[locked], painted[locked])
+    assert np.array_equal(weights[:, jaw], painted[:, jaw])
+    assert not np.array_equal(weights, painted)
+    assert (weights > 0).sum(axis=1).max() <= 4
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=2e-6)
+    # The marks are still in a .glb, as all else that we did not make.
+    if suffix == "glb":
+        again = skin(run, "kept.glb", "again.glb", "--lock-vertices", "_OTHER")
+        assert np.array_equal(again[~locked], weights[~locked])
 
 
-def test_a_locked_bone_takes_one_of_the_influences(corner):
-    predicted = np.tile([0.0, 0.25, 0.125, 0.625], (3, 1))
-    weights = cli.finish(corner, predicted, locked=[0], max_influences=2)
-    np.testing.assert_allclose(weights, np.tile([0.25, 0, 0, 0.75], (3, 1)))
-
-
-def test_an_unpainted_locked_bone_takes_none(corner):
-    predicted = np.tile([0.1, 0.2, 0.3, 0.4], (3, 1))
-    weights = cli.finish(corner, predicted, locked=[3], max_influences=2)
-    np.testing.assert_allclose(weights, np.tile([0, 0.4, 0.6, 0], (3, 1)))
-
-
-def test_locked_bones_that_need_more_influences_are_an_error(corner):
-    with pytest.raises(HeadError, match="leave vertices with 3 influences"):
-        cli.finish(corner, corner.weights, locked=[0, 1], max_influences=1)
+def test_smooth(run):
+    plain = skin(run, "bare.npz", "out.npz")
+    smooth = skin(run, "bare.npz", "out.npz", "--smooth", 3)
+    head = read_head("bare.npz")
+    expected = prune(smooth_weights(head, plain, 3), 0.01)
+    np.testing.assert_allclose(smooth, expected, atol=1e-6)
 
 
 # ---------------------------------------------------------------------- train, evaluate
@@ -272,6 +284,20 @@ def test_evaluate_writes_the_table_and_the_numbers(run, capsys):
         ("skin bare.npz out.npz --max-influences 0", "--max-influences"),
         ("skin bare.npz out.npz --lock mouth_of_truth", "mouth_of_truth"),
         ("skin bare.npz out.npz --lock head", "no weights that could be kept"),
+        (
+            "skin heads/head_0.npz out.npz --lock-vertices _LOCKED",
+            "heads/head_0.npz: _LOCKED: there is no such attribute",
+        ),
+        (
+            "skin marked.npz out.npz --lock-vertices _LOCK",
+            "_LOCK: there is no such attribute of the vertices, only locked",
+        ),
+        ("skin marked.npz out.npz --lock-vertices _LOCKED", "no weights that could"),
+        (
+            "skin full.npz out.npz --lock-vertices _LOCKED --max-influences 1",
+            "full.npz: --max-influences: what is locked leaves vertex",
+        ),
+        ("skin bare.npz out.npz --smooth -1", "--smooth"),
         ("skin bare.npz nowhere/out.npz", "nowhere"),
         ("train --labelled nowhere --out new2", "nowhere"),
         ("train --labelled heads --out new2 --device quantum", "quantum"),

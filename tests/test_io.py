@@ -7,6 +7,7 @@ import struct
 import zipfile
 
 import numpy as np
+import pygltflib
 import pytest
 from gltf_files import (
     FACES,
@@ -24,8 +25,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from skinlib.blender.run import run_script
 from skinlib.head import Head, HeadError, Skeleton
-from skinlib.io import NPZ_KEYS, read_head, write_head
+from skinlib.io import NPZ_KEYS, read_head, read_vertex_mask, write_head
 
 SKELETON = Skeleton.from_heads_and_tails(
     JOINTS, JOINTS + np.array([0, 0.5, 0]), [-1, 0, 1], ["neck", "head", "jaw"]
@@ -609,6 +611,268 @@ def test_only_glb_is_reskinned(tmp_path, source, target, words):
         skinned_builder().write(tmp_path / name)
     with pytest.raises(HeadError, match=words):
         write_head(tmp_path / target, HEAD, source=tmp_path / source)
+
+
+# --- colours, and attributes of your own ----------------------------------------------
+
+COLOURS = np.linspace(0, 1, 18).reshape(6, 3)
+SURE = np.array([1, 0.5, 0.25, 0, 0.75, 0.125])
+EXTRAS = {"colours": COLOURS, "attributes": {"_CONFIDENCE": SURE}}
+
+
+def floats(tree: dict, blob: bytes, name: str, mesh: int = 0, part: int = 0):
+    """An attribute as numbers, normalised as its accessor says."""
+    attributes = tree["meshes"][mesh]["primitives"][part]["attributes"]
+    array = plain_array(tree, blob, attributes[name])
+    normalized = tree["accessors"][attributes[name]].get("normalized")
+    return array / np.iinfo(array.dtype).max if normalized else array
+
+
+def test_colours_and_attributes_of_a_new_file(tmp_path):
+    path = tmp_path / "head.glb"
+    write_head(path, HEAD, **EXTRAS)
+    assert_same(read_head(path), HEAD)
+    tree, blob = unpack(path)
+    expected = np.pad(COLOURS, ((0, 0), (0, 1)), constant_values=1)
+    np.testing.assert_allclose(floats(tree, blob, "COLOR_0"), expected, atol=0.002)
+    np.testing.assert_array_equal(floats(tree, blob, "_CONFIDENCE"), SURE)
+    # The same through pygltflib.
+    document = pygltflib.GLTF2().load(path)
+    attributes = document.meshes[0].primitives[0].attributes
+    accessor = document.accessors[attributes.COLOR_0]
+    assert (accessor.type, accessor.componentType) == ("VEC4", pygltflib.UNSIGNED_BYTE)
+    assert accessor.normalized
+    assert document.accessors[attributes._CONFIDENCE].type == "SCALAR"
+
+
+def test_colours_and_attributes_of_a_npz(tmp_path):
+    path = tmp_path / "head.npz"
+    write_head(path, HEAD, colours=np.eye(6, 4), attributes={"_CONFIDENCE": SURE})
+    assert_same(read_head(path), HEAD, tails_exact=False)
+    arrays = np.load(path)
+    np.testing.assert_array_equal(arrays["colours"], 255 * np.eye(6, 4))
+    np.testing.assert_array_equal(arrays["confidence"], SURE)
+    assert read_vertex_mask(path, "_CONFIDENCE").tolist() == (SURE > 0.5).tolist()
+
+
+def test_the_artists_colours_stay_and_ours_are_written_anew(tmp_path):
+    builder = rich_builder()
+    primitive = builder.tree["meshes"][0]["primitives"][0]
+    painted = np.full((6, 3), 0.25)
+    primitive["attributes"]["COLOR_0"] = builder.array(painted)
+    source = builder.write(tmp_path / "in.glb")
+    path = tmp_path / "out.glb"
+    head = read_head(source)
+    write_head(path, head, source=source, **EXTRAS)
+    size = path.stat().st_size
+    for _ in range(2):  # again, onto itself
+        write_head(
+            path,
+            head,
+            source=path,
+            colours=1 - COLOURS,
+            attributes={"_CONFIDENCE": 1 - SURE},
+        )
+    assert path.stat().st_size == size
+    tree, blob = unpack(path)
+    attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+    assert sorted(name for name in attributes if "COLOR" in name) == [
+        "COLOR_0",
+        "COLOR_1",
+    ]
+    np.testing.assert_array_equal(floats(tree, blob, "COLOR_0"), painted)
+    ours = floats(tree, blob, "COLOR_1")[:, :3]
+    np.testing.assert_allclose(ours, 1 - COLOURS, atol=0.002)
+    np.testing.assert_array_equal(floats(tree, blob, "_CONFIDENCE"), 1 - SURE)
+    # Without new ones they stay, as all else does.
+    write_head(path, head, source=path)
+    tree, blob = unpack(path)
+    np.testing.assert_array_equal(floats(tree, blob, "COLOR_1")[:, :3], ours)
+
+
+def two_parts(**second) -> Builder:
+    """The first and the last four vertices of the strip, as parts of one mesh."""
+    builder = skinned_builder()
+    first = builder.tree["meshes"][0]["primitives"][0]
+    attributes = {
+        "POSITION": builder.array(VERTICES[2:] + 1),
+        "JOINTS_0": builder.array(np.zeros((4, 4)), "u1"),
+        "WEIGHTS_0": builder.array(np.eye(4)[[0, 0, 0, 0]]),
+    }
+    parts = [first, {"attributes": attributes | second}]
+    parts[1]["indices"] = builder.array([0, 1, 2], "u2")
+    builder.tree["meshes"][0]["primitives"] = parts
+    return builder
+
+
+def test_parts_without_colours_become_white_before_ours(tmp_path):
+    builder = two_parts()
+    second = builder.tree["meshes"][0]["primitives"][1]
+    second["attributes"]["COLOR_0"] = builder.array(np.zeros((4, 3)))
+    source = builder.write(tmp_path / "in.glb")
+    head = read_head(source)
+    colours = np.tile([[0.0, 0.2, 1.0]], (10, 1))
+    write_head(tmp_path / "out.glb", head, source=source, colours=colours)
+    tree, blob = unpack(tmp_path / "out.glb")
+    assert (floats(tree, blob, "COLOR_0", part=0) == 1).all()
+    assert (floats(tree, blob, "COLOR_0", part=1) == 0).all()
+    for part, count in ((0, 6), (1, 4)):
+        ours = floats(tree, blob, "COLOR_1", part=part)
+        np.testing.assert_allclose(ours, [[0, 0.2, 1, 1]] * count)
+
+
+@pytest.mark.parametrize(
+    ("extras", "words"),
+    [
+        ({"colours": np.zeros((5, 3))}, r"colours: an array of shape \(5, 3\)"),
+        ({"colours": np.full((6, 3), 255.0)}, "colours: values from 255 to 255"),
+        ({"colours": np.full((6, 4), np.nan)}, "colours: values from nan"),
+        ({"attributes": {"SURE": SURE}}, "SURE: a name that is not free"),
+        ({"attributes": {"_WEIGHTS": SURE}}, "_WEIGHTS: a name that is not free"),
+        ({"attributes": {"_A/B": SURE}}, "_A/B: a name that is not free"),
+        ({"attributes": {"_SURE": SURE[1:]}}, r"_SURE: float64 values of shape \(5,\)"),
+        ({"attributes": {"_SURE": SURE + np.inf}}, "_SURE: NaN or infinity"),
+    ],
+)
+@pytest.mark.parametrize("name", ["out.glb", "out.npz"])
+def test_bad_colours_and_attributes(tmp_path, name, extras, words):
+    with pytest.raises(HeadError, match=f"{name}: {words}"):
+        write_head(tmp_path / name, HEAD, **extras)
+    assert os.listdir(tmp_path) == []
+
+
+MARKED = np.array([0, 1, 1, 0, 0, 1])
+
+
+@pytest.mark.parametrize("suffix", ["glb", "gltf"])
+@pytest.mark.parametrize(
+    ("values", "dtype", "options"),
+    [
+        (MARKED, "f4", {}),
+        (MARKED, "u1", {}),
+        (MARKED * 255, "u1", {"normalized": True}),
+        (MARKED * 0.2 + 0.4, "f4", {}),
+    ],
+)
+def test_a_mask_of_a_gltf_file(tmp_path, suffix, values, dtype, options):
+    builder = skinned_builder()
+    attributes = builder.tree["meshes"][0]["primitives"][0]["attributes"]
+    attributes["_LOCKED"] = builder.array(values, dtype, **options)
+    path = builder.write(tmp_path / f"head.{suffix}")
+    for name in ("_LOCKED", "locked"):
+        mask = read_vertex_mask(path, name)
+        assert mask.dtype == bool
+        assert mask.tolist() == MARKED.astype(bool).tolist()
+
+
+def test_a_part_that_lacks_the_attribute_is_not_marked(tmp_path):
+    builder = two_parts()
+    first = builder.tree["meshes"][0]["primitives"][0]
+    first["attributes"]["_LOCKED"] = builder.array(np.ones(6))
+    path = builder.write(tmp_path / "head.glb")
+    assert len(read_head(path).vertices) == 10
+    assert read_vertex_mask(path).tolist() == [True] * 6 + [False] * 4
+
+
+@pytest.mark.parametrize("values", [MARKED, MARKED > 0, MARKED * 0.7])
+def test_a_mask_of_a_npz(tmp_path, values):
+    np.savez(tmp_path / "head.npz", **npz_arrays(locked=values))
+    for name in ("_LOCKED", "locked"):
+        mask = read_vertex_mask(tmp_path / "head.npz", name)
+        assert mask.tolist() == MARKED.astype(bool).tolist()
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        (MARKED[1:], r"locked: int64 values of shape \(5,\) for 6 vertices"),
+        (MARKED.astype(str), "locked: <U.* values"),
+        (np.where(MARKED, 1, np.nan), "_LOCKED: vertex 0 has NaN"),
+        (MARKED.astype(object), "locked: it holds pickled"),
+    ],
+)
+def test_a_bad_mask(tmp_path, values, words):
+    np.savez(tmp_path / "head.npz", **npz_arrays(locked=values))
+    with pytest.raises(HeadError, match=f"head.npz: {words}"):
+        read_vertex_mask(tmp_path / "head.npz")
+
+
+def test_a_mask_that_is_no_number_or_too_short(tmp_path):
+    for values, words in ((VERTICES, "an accessor of VEC3"), (MARKED[1:], "5 values")):
+        builder = skinned_builder()
+        attributes = builder.tree["meshes"][0]["primitives"][0]["attributes"]
+        attributes["_LOCKED"] = builder.array(values)
+        path = builder.write(tmp_path / "head.glb")
+        with pytest.raises(HeadError, match=f"head.glb: _LOCKED: {words}"):
+            read_vertex_mask(path)
+
+
+@pytest.mark.parametrize("suffix", ["glb", "npz"])
+def test_a_missing_attribute_is_told_with_those_that_are_there(tmp_path, suffix):
+    path = tmp_path / f"head.{suffix}"
+    write_head(path, HEAD)
+    with pytest.raises(HeadError, match=r"_LOCKED: there is no .*, nor any other\."):
+        read_vertex_mask(path)
+    write_head(path, HEAD, attributes={"_SURE": SURE, "_EDGE": SURE})
+    there = "_EDGE, _SURE" if suffix == "glb" else "edge, sure"
+    with pytest.raises(HeadError, match=f"vertices, only {there}. Name one"):
+        read_vertex_mask(path)
+
+
+def test_weights_that_sum_to_1_in_a_head_stay_to_the_bit(tmp_path):
+    weights = WEIGHTS.copy()
+    weights[3] = [0.5, 0.25, 0.2500006]
+    head = HEAD.replace(weights=weights)
+    np.testing.assert_array_equal(head.weights, weights)
+    for name in ("head.glb", "head.npz"):
+        write_head(tmp_path / name, head)
+        np.testing.assert_array_equal(read_head(tmp_path / name).weights, weights)
+
+
+BLENDER_SCRIPT = """
+import sys
+import bpy
+import numpy as np
+
+source, target = sys.argv[-2:]
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.import_scene.gltf(filepath=source)
+(mesh,) = [o.data for o in bpy.data.objects if o.type == "MESH" and o.vertex_groups]
+sure = [entry.value for entry in mesh.attributes["_CONFIDENCE"].data]
+layers = {layer.name: [entry.color[:] for entry in layer.data]
+          for layer in mesh.color_attributes}
+corners = [loop.vertex_index for loop in mesh.loops]
+mesh.attributes.new("_locked", "BOOLEAN", "POINT").data[2].value = True
+bpy.ops.export_scene.gltf(filepath=target + ".glb", export_attributes=True)
+np.savez(target, sure=sure, corners=corners, **layers)
+"""
+
+
+@pytest.mark.skipif(
+    "SKINLIB_BLENDER" not in os.environ,
+    reason="SKINLIB_BLENDER names no Blender, nor a Python with bpy",
+)
+def test_blender_sees_our_colours_and_we_its_attributes(tmp_path):
+    builder = skinned_builder()
+    primitive = builder.tree["meshes"][0]["primitives"][0]
+    primitive["attributes"]["COLOR_0"] = builder.array(np.full((6, 3), 0.25))
+    source = builder.write(tmp_path / "in.glb")
+    write_head(tmp_path / "out.glb", read_head(source), source=source, **EXTRAS)
+    (tmp_path / "script.py").write_text(BLENDER_SCRIPT)
+    run_script(
+        tmp_path / "script.py", tmp_path / "out.glb", tmp_path / "seen.npz", timeout=300
+    )
+    seen = np.load(tmp_path / "seen.npz")
+    np.testing.assert_allclose(seen["sure"], SURE)
+    # Blender keeps 8 bits of a colour, spaced for the eye.
+    painted, ours = seen["Color"][:, :3], seen["Color.001"][:, :3]
+    np.testing.assert_allclose(painted, 0.25, atol=0.01)
+    np.testing.assert_allclose(ours, COLOURS[seen["corners"]], atol=0.01)
+    # An attribute `_locked` of Blender's own; its export may split vertices.
+    path = tmp_path / "seen.npz.glb"
+    mask = read_vertex_mask(path)
+    locked = read_head(path).vertices[mask]
+    assert len(locked) and np.ptp(locked, axis=0).max() == 0
 
 
 # --- bad files -----------------------------------------------------------------------

@@ -1,23 +1,20 @@
 import numpy as np
 import pytest
 import torch
+from shapes import mirrored_square
 
 from skinlib.datasets.synthetic import synthetic_head
-from skinlib.head import Head, HeadError, Skeleton
+from skinlib.head import HeadError, Skeleton
 from skinlib.skinning import (
     PRESET_POSES,
     descendants,
     find_bones,
     forward_kinematics,
     head_bone,
-    limit_influences,
     linear_blend_skinning,
-    lock_bones,
     mirror_pairs,
     mirror_vertices,
     preset_pose,
-    prune,
-    symmetrize,
     upper_lids,
 )
 
@@ -34,11 +31,6 @@ def arm():
     return Skeleton.from_heads_and_tails(
         [[2, 0, 0], [0, 0, 0], [1, 0, 0]], None, [2, -1, 1], ["hand", "upper", "lower"]
     )
-
-
-def random_weights(rng, shape):
-    weights = rng.random(shape) ** 4
-    return (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
 def random_rotations(rng, *shape):
@@ -109,62 +101,6 @@ def test_a_pose_of_another_skeleton_is_refused(arm):
         forward_kinematics(arm, np.zeros((2, 3, 3)))
 
 
-# --- prune, limit, lock ---------------------------------------------------------------
-
-
-def test_prune_keeps_the_largest_weight_always():
-    weights = np.array([[0.4, 0.35, 0.25], [0.96, 0.04, 0.0]], np.float32)
-    np.testing.assert_allclose(
-        prune(weights, 0.5), [[1, 0, 0], [1, 0, 0]], rtol=0, atol=0
-    )
-    np.testing.assert_allclose(prune(weights, 0.3)[0], [0.4 / 0.75, 0.35 / 0.75, 0])
-
-
-@pytest.mark.parametrize("count", [1, 4, 8])
-def test_limit_keeps_the_largest_and_sums_to_one(count):
-    weights = random_weights(np.random.default_rng(1), (200, 12))
-    limited = limit_influences(weights, count)
-    assert limited.dtype == np.float32
-    assert ((limited > 0).sum(axis=1) <= count).all()
-    np.testing.assert_allclose(limited.sum(axis=1), 1, atol=1e-6)
-    assert (limited.argmax(axis=1) == weights.argmax(axis=1)).all()
-    dropped = np.where(limited == 0, weights, 0).max(axis=1)
-    kept = np.where(limited > 0, weights, 1).min(axis=1)
-    assert (dropped <= kept).all()
-
-
-def test_limit_leaves_rows_within_the_limit_alone():
-    weights = np.array([[0.7, 0.2, 0.1], [0.3, 0.7, 0.0]], np.float32)
-    assert (limit_influences(weights, 2)[1] == weights[1]).all()
-    assert limit_influences(weights, 3) is weights
-    with pytest.raises(ValueError, match="at least 1"):
-        limit_influences(weights, 0)
-
-
-def test_locked_columns_are_kept_to_the_bit():
-    rng = np.random.default_rng(2)
-    original, predicted = random_weights(rng, (300, 9)), random_weights(rng, (300, 9))
-    locked = lock_bones(predicted, original, [1, 4])
-    assert locked.dtype == original.dtype
-    assert (locked[:, [1, 4]] == original[:, [1, 4]]).all()
-    assert locked.min() >= 0
-    np.testing.assert_allclose(locked.sum(axis=1), 1, atol=1e-6)
-    free = [0, 2, 3, 5, 6, 7, 8]
-    np.testing.assert_allclose(
-        locked[:, free] / locked[:, free].sum(axis=1, keepdims=True),
-        predicted[:, free] / predicted[:, free].sum(axis=1, keepdims=True),
-        atol=1e-5,
-    )
-
-
-def test_lock_when_the_prediction_leaves_the_rest_nothing():
-    original = np.array([[0.25, 0.5, 0.25], [1, 0, 0]], np.float32)
-    predicted = np.array([[1, 0, 0], [0, 1, 0]], np.float32)
-    np.testing.assert_array_equal(lock_bones(predicted, original, [0]), original)
-    everything = lock_bones(predicted, original, [0, 1, 2])
-    np.testing.assert_array_equal(everything, original)
-
-
 # --- mirror ---------------------------------------------------------------------------
 
 
@@ -215,37 +151,13 @@ def test_pairs_of_a_tiny_skeleton_are_a_permutation(joints):
     assert (pairs[pairs] == np.arange(count)).all()
 
 
-def mirrored_square():
-    """Two vertices left, two right, two in the middle; a bone on each side."""
-    skeleton = Skeleton.from_heads_and_tails(
-        [[0, 0, 0], [1, 1, 0], [-1, 1, 0]], None, [-1, 0, 0], ["head", "a", "b"]
-    )
-    vertices = [[1, 0, 0], [0, 0, 0], [-1, 0, 0], [1, 1, 0], [0, 1, 0], [-1, 1, 0]]
-    faces = [[0, 3, 1], [3, 4, 1], [1, 4, 2], [4, 5, 2]]
-    return Head.create(vertices, faces, skeleton)
-
-
-def test_symmetrize_averages_with_the_other_side():
+def test_a_vertex_without_a_partner():
     head = mirrored_square()
     assert mirror_vertices(head).tolist() == [2, 1, 0, 5, 4, 3]
-    weights = np.zeros((6, 3), np.float32)
-    weights[:, 0] = 1
-    weights[0] = [0.5, 0.5, 0]  # only the left side follows its bone
-    result = symmetrize(head, weights)
-    np.testing.assert_allclose(result[0], [0.75, 0.25, 0])
-    np.testing.assert_allclose(result[2], [0.75, 0, 0.25])
-    np.testing.assert_allclose(symmetrize(head, result), result)
-    np.testing.assert_allclose(result.sum(axis=1), 1)
-
-
-def test_symmetrize_leaves_vertices_without_a_partner():
-    head = mirrored_square()
     vertices = np.array(head.vertices)
     vertices[0] = [1.4, -0.3, 0]
-    head = head.replace(vertices=vertices)
-    weights = random_weights(np.random.default_rng(3), (6, 3))
-    assert mirror_vertices(head)[[0, 2]].tolist() == [-1, -1]
-    np.testing.assert_array_equal(symmetrize(head, weights)[[0, 2]], weights[[0, 2]])
+    partner = mirror_vertices(head.replace(vertices=vertices))
+    assert partner.tolist() == [-1, 1, -1, 5, 4, 3]
 
 
 def test_the_mirror_image_lies_on_the_mirrored_piece(head):

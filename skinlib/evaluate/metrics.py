@@ -14,13 +14,13 @@ from scipy.spatial.transform import Rotation
 from skinlib.geometry import canonical_frame, mesh_edges
 from skinlib.graph import seam_nodes
 from skinlib.head import Head, HeadError, Skeleton
+from skinlib.painting import limit_influences
 from skinlib.skinning import (
     PRESET_POSES,
     descendants,
     find_bones,
     forward_kinematics,
     head_bone,
-    limit_influences,
     linear_blend_skinning,
     mirror_pairs,
     mirror_vertices,
