@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import tyro
-from rocketbox import apart, split
 from tyro.conf import Positional
 
 from skinlib.datasets.folder import load_folder
+from skinlib.evaluate.groups import apart, fold
 from skinlib.losses import TermWeights
 from skinlib.training import HISTORY, TrainConfig, train
 from skinlib.views.plots import training_curves
@@ -38,7 +38,7 @@ class Run:
 
 def main(run: Run) -> None:
     """Train, then draw."""
-    training, held_out = split(load_folder(run.heads), 0)
+    training, held_out = fold(load_folder(run.heads), 0)
     labelled, hidden = training[::2], training[1::2]
     more = load_folder(run.unlabelled) if run.unlabelled else []
     bare = [head.replace(weights=None) for head in [*hidden, *apart(more, held_out)]]

@@ -3,10 +3,9 @@
     python benchmarks/rocketbox.py HEADS OUT --config.minutes 30 [--fold 0]
     python benchmarks/rocketbox.py HEADS OUT --fold none --extra MORE  # judge nothing
 
-Heads are split into `FOLDS` folds by topology group; a group that holds more than a
-quarter of all heads is always trained on. Groups are joined at 0.47 shared topology,
-more strictly than the default, so that no edit of a base mesh is on both sides. Writes
-`OUT/model` and `OUT/scores.json`, and prints the table beside the classical methods.
+Folds are those of `skinlib.evaluate.groups.fold`: no edit of a base mesh is on both
+sides. Writes `OUT/model` and `OUT/scores.json`, and prints the table beside the
+classical methods.
 """
 
 import json
@@ -14,35 +13,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import tyro
 from tyro.conf import Positional
 
 from skinlib.datasets.folder import load_folder
 from skinlib.evaluate.compare import evaluate, format_table
-from skinlib.evaluate.groups import shared_topology, topology_groups
+from skinlib.evaluate.groups import apart, fold
 from skinlib.training import TrainConfig, load_model, train
-
-FOLDS = 4
-SHARED = 0.47
-
-
-def split(heads: list, fold: int) -> tuple[list, list]:
-    """(training heads, held-out heads) of a fold; they share no topology group."""
-    groups = np.array(topology_groups(heads, SHARED))
-    sizes = np.bincount(groups)
-    small = np.flatnonzero(sizes <= len(heads) / 4)
-    held_out = np.isin(groups, small[fold::FOLDS])
-    pairs = list(zip(heads, held_out, strict=True))
-    return [h for h, out in pairs if not out], [h for h, out in pairs if out]
-
-
-def apart(heads: list, held_out: list) -> list:
-    """The heads that share no topology with any of the held-out ones."""
-    if not held_out:
-        return heads
-    similarity = shared_topology([*held_out, *heads])[: len(held_out), len(held_out) :]
-    return [heads[i] for i in np.flatnonzero(similarity.max(axis=0) <= SHARED)]
 
 
 @dataclass(frozen=True)
@@ -62,7 +39,7 @@ def main(run: Run) -> None:
     """Split, train, judge, write."""
     heads = load_folder(run.heads)
     labelled, held_out = (
-        (heads, []) if run.fold == "none" else split(heads, int(run.fold))
+        (heads, []) if run.fold == "none" else fold(heads, int(run.fold))
     )
     # A remeshed copy is called NAME__HOW; a copy of a held-out head is held out too.
     known, hidden = ({head.name for head in some} for some in (heads, held_out))

@@ -1,8 +1,17 @@
 import numpy as np
+import pytest
 
 from skinlib.datasets.synthetic import synthetic_head
-from skinlib.evaluate.groups import group_split, shared_topology, topology_groups
-from skinlib.head import Head, Skeleton
+from skinlib.evaluate.groups import (
+    FOLDS,
+    STRICT,
+    apart,
+    fold,
+    group_split,
+    shared_topology,
+    topology_groups,
+)
+from skinlib.head import Head, HeadError, Skeleton
 
 BONE = Skeleton.from_heads_and_tails([[0, 0, 0]], None, [-1], ["head"])
 
@@ -57,3 +66,24 @@ def test_a_split_never_cuts_a_group():
         assert not set(groups[training]) & set(groups[validation])
     assert group_split(heads, 0.4, 1) == group_split(heads, 0.4, 1)
     assert group_split(heads[:2], 0.4, 0) == ([0, 1], [])
+
+
+def test_folds_hold_out_every_small_group_once():
+    heads = [*family(1, 5), *(family(seed, 1)[0] for seed in range(2, 9))]
+    held_out = []
+    for number in range(FOLDS):
+        training, judged = fold(heads, number)
+        assert len(training) + len(judged) == len(heads)
+        similarity = shared_topology([*training, *judged])
+        assert similarity[: len(training), len(training) :].max() <= STRICT
+        held_out += judged
+    # The family of five is more than a quarter of the twelve: always trained on.
+    assert sorted(map(id, held_out)) == sorted(map(id, heads[5:]))
+    with pytest.raises(HeadError, match="fold 3"):
+        fold(heads[:5], 3)
+
+
+def test_heads_apart_share_no_mesh():
+    heads = family(1, 2) + family(2, 1)
+    assert apart(heads[1:], heads[:1]) == heads[2:]
+    assert apart(heads, []) == heads

@@ -11,12 +11,15 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from skinlib.geometry import neighbourhood_kinds
-from skinlib.head import Head
+from skinlib.head import Head, HeadError
 
 # There is no gap between edits of one mesh and other heads: similarity falls off
 # gradually. On 82 game characters 0.5 gives the number of heads, 38, that are known to
 # share a base mesh; a lower value makes larger groups and a stricter split.
 SHARED = 0.5
+# For folds: so strict that no edit of a base mesh is on both sides.
+STRICT = 0.47
+FOLDS = 4
 ROUNDS = 3
 
 
@@ -77,6 +80,38 @@ def group_split(
         if abs(grown - wanted) < abs(held_out.sum() - wanted) and grown < len(heads):
             held_out |= members
     return np.flatnonzero(~held_out).tolist(), np.flatnonzero(held_out).tolist()
+
+
+def fold(heads: Sequence[Head], number: int) -> tuple[list[Head], list[Head]]:
+    """(training heads, held-out heads) of fold `number` of `FOLDS`.
+
+    The two share no topology group; groups are joined at `STRICT` shared topology. A
+    group that holds more than a quarter of all heads is always trained on, where there
+    are others.
+
+    Raises:
+        HeadError: nothing is held out, or nothing is left to train on.
+    """
+    groups = np.array(topology_groups(heads, STRICT))
+    sizes = np.bincount(groups)
+    small = np.flatnonzero(sizes <= max(1, len(heads) / 4))
+    held_out = np.isin(groups, small[number::FOLDS])
+    if held_out.all() or not held_out.any():
+        raise HeadError(
+            "heads",
+            f"{len(heads)} heads in {len(sizes)} topology groups make no fold {number}",
+            "give more heads, with meshes of their own",
+        )
+    pairs = list(zip(heads, held_out, strict=True))
+    return [h for h, out in pairs if not out], [h for h, out in pairs if out]
+
+
+def apart(heads: Sequence[Head], held_out: Sequence[Head]) -> list[Head]:
+    """The heads that share no topology (`STRICT`) with any of the held-out ones."""
+    if not held_out:
+        return list(heads)
+    similarity = shared_topology([*held_out, *heads])[: len(held_out), len(held_out) :]
+    return [heads[i] for i in np.flatnonzero(similarity.max(axis=0) <= STRICT)]
 
 
 def _neighbourhoods(head: Head) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""HeadBench: the judge of skin weights."""
