@@ -10,20 +10,20 @@ and seed that is in OUT already is not run again; several processes may share OU
 """
 
 import json
-import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import tyro
-from rocketbox import FOLDS, apart, split
 from tqdm import tqdm
 from tyro.conf import Positional
 
 from skinlib.datasets.folder import load_folder
+from skinlib.evaluate.groups import FOLDS, apart, fold
 from skinlib.evaluate.metrics import row_l1
+from skinlib.headbench.networks import ByProcessorTime
 from skinlib.losses import LossWeights, TermWeights
-from skinlib.training import AS_WRITTEN, SUPERVISED_ONLY, TrainConfig, Trainer
+from skinlib.training import AS_WRITTEN, SUPERVISED_ONLY, TrainConfig
 
 SEED_LOSS = LossWeights(row_l1=0.0, cross_entropy=0.0, seed=1.0)
 
@@ -56,12 +56,6 @@ ARMS = {
 }
 
 
-class ByProcessorTime(Trainer):
-    """Counts the time it computes, so that no arm pays for the machine's other work."""
-
-    clock = staticmethod(time.process_time)
-
-
 @dataclass(frozen=True)
 class Run:
     """What do unlabelled heads, critics and each term give?"""
@@ -87,9 +81,7 @@ def main(run: Run) -> None:
         folder = run.out / name
         if (folder / "scores.json").exists():
             continue
-        training, held_out = split(
-            heads, seed % FOLDS if run.fold is None else run.fold
-        )
+        training, held_out = fold(heads, seed % FOLDS if run.fold is None else run.fold)
         order = np.random.default_rng(seed).permutation(len(training))
         painted, hidden = np.split(order, [run.labelled])
         painted, hidden = ([training[i] for i in ids] for ids in (painted, hidden))

@@ -1,4 +1,4 @@
-"""The command line: `skinlib skin | train | evaluate | lab | demo | check`.
+"""The command line: `skinlib skin | train | evaluate | bench | lab | demo | check`.
 
 Each command is a function; its signature and docstring are its options and its help.
 Everything slow to import is imported when a command runs, so that `--help` is quick.
@@ -40,13 +40,15 @@ def skin(
     lock_vertices: Annotated[str | None, arg(metavar="ATTRIBUTE")] = None,
     smooth: Annotated[int, arg(metavar="N")] = 0,
     symmetric: bool = False,
+    confidence: bool = False,
 ) -> None:
     """Compute skin weights for a head.
 
     IN holds one head and its bones: a .glb or .gltf as exported from Blender, Maya or
-    Unreal, or a .npz. Any unit, any up-axis, 1 to 200 bones with any names. It may be
-    skinned already, or not at all. OUT is a .glb or .npz. From .glb to .glb everything
-    else in the file is kept: materials, blend shapes, other meshes, animations.
+    Unreal, a .npz, or, with a Blender at hand, a .blend or .fbx. Any unit, any up-axis,
+    1 to 200 bones with any names. It may be skinned already, or not at all. Everything
+    else in IN is in OUT, too, unless one of them is a .npz: materials, blend shapes,
+    other meshes, animations.
 
     For example:
       skinlib skin head.glb skinned.glb
@@ -54,6 +56,8 @@ def skin(
       skinlib skin painted.glb new.glb --lock jaw tongue
       skinlib skin painted.glb new.glb --lock-vertices _LOCKED --smooth 2
       skinlib skin guard.glb skinned.glb --painted cast
+      skinlib skin head.glb skinned.glb --confidence
+      skinlib skin head.blend skinned.blend
 
     Args:
         source: The head to skin.
@@ -69,10 +73,17 @@ def skin(
             calms noise, and blurs what is painted well.
         symmetric: Same weights on the left and on the right, where the mesh has both;
             where one side is locked, the other follows it.
+        confidence: Colour the vertices of OUT, white where the weights are right for
+            sure, red where to look before you ship; _CONFIDENCE has the number, 0 to 1.
     """
     from skinlib.datasets.folder import load_folder
-    from skinlib.gltf import MAX_ELEMENTS
+    from skinlib.gltf import CONFIDENCE, MAX_ELEMENTS
     from skinlib.io import check_target, read_head, read_vertex_mask, write_head
+    from skinlib.model.confidence import (
+        colours,
+        load_calibration,
+        predict_with_confidence,
+    )
     from skinlib.painting import finish
     from skinlib.training import load_model
     from skinlib.training.propagation import Propagation
@@ -102,11 +113,20 @@ def skin(
         )
     if smooth < 0:
         raise HeadError("--smooth", f"{smooth}", "give 0 or more", source)
-    weights, note = load_model(checkpoint).predict(head), ""
+    model, note, paint = load_model(checkpoint), "", {}
+    if confidence:
+        calibration = load_calibration(checkpoint)
+        weights, sure = predict_with_confidence(model, head, calibration)
+    else:
+        weights, sure = model.predict(head), np.ones(count)
     if painted:
         rows, known = Propagation(load_folder(painted)).rows(head)
-        weights = np.where(known[:, None], rows, weights)
+        weights, sure = np.where(known[:, None], rows, weights), np.maximum(sure, known)
         note = f"\n{known.mean():.0%} of the vertices are as in {painted}"
+    if confidence:
+        sure = sure if vertices is None else np.maximum(sure, vertices)
+        paint = {"colours": colours(sure), "attributes": {CONFIDENCE: sure}}
+        note += f"\n{(sure < 0.5).mean():.0%} of the vertices are rather wrong than not"
     weights = finish(
         head,
         weights,
@@ -117,9 +137,10 @@ def skin(
         max_influences=max_influences,
         file=source,
     )
-    both_glb = source.suffix.lower() == target.suffix.lower() == ".glb"
+    whole = source.suffix.lower() in {".glb", ".blend", ".fbx"}
+    whole &= target.suffix.lower() != ".npz"
     skinned = head.replace(weights=weights)
-    write_head(target, skinned, source=source if both_glb else None)
+    write_head(target, skinned, source=source if whole else None, **paint)
     used = int((weights > 0).sum(axis=1).max())
     print(
         f"{target}: {count:,} vertices, {bones:,} bones, at most {used} a vertex{note}"
@@ -256,6 +277,67 @@ def evaluate(
             file.write(f"{json.dumps(scores, indent=1)}\n".encode())
 
 
+def bench(
+    *,
+    out: Folder,
+    heads: OptionalFolder = None,
+    unlabelled: OptionalFolder = None,
+    others: OptionalFolder = None,
+    folds: Annotated[tuple[int, ...], arg(metavar="N ...")] = (0, 1, 2),
+    minutes: Annotated[float | None, arg(metavar="M")] = None,
+    suites: Annotated[tuple[str, ...], arg(metavar="SUITE ...")] = (),
+    methods: Annotated[tuple[str, ...], arg(metavar="METHOD ...")] = (),
+) -> None:
+    """HeadBench: every method on every suite of heads that it has not learnt from.
+
+    Trains the networks that take part, on all topology groups but the held-out ones,
+    then judges them beside the classical methods: untouched heads, remeshed, reordered,
+    with pieces missing, rotated, posed, on changed skeletons. Writes a page with tables
+    and figures, OUT/page/index.html. Can be stopped; the same command goes on.
+
+    For example:
+      skinlib bench --out runs/bench                        # small synthetic heads
+      skinlib bench --heads my_heads --out runs/mine --minutes 30
+
+    A network of your own takes part when its folder lies in OUT/networks/fold0.
+
+    Args:
+        out: Folder for networks, scores and the page; made when there is none.
+        heads: Folder of skinned heads with several base meshes; synthetic ones when
+            left out.
+        unlabelled: Folder of heads without weights, for the semi-supervised network.
+        others: Folder of skinned heads with other rigs, only to be judged by.
+        folds: Which quarters of the topology groups are held out, in turn: 0 to 3.
+        minutes: Processor time for each network to be trained; 8, or a quarter of one
+            on synthetic heads.
+        suites: Only these; all when left out.
+        methods: Only these; all that work here when left out.
+    """
+    from skinlib.datasets.folder import load_folder
+    from skinlib.datasets.synthetic import synthetic_heads
+    from skinlib.headbench import bench as headbench
+    from skinlib.headbench.networks import OURS
+    from skinlib.headbench.targets import targets
+    from skinlib.views.headbench import markdown, methods_table, write_page
+
+    minutes = minutes if minutes is not None else 8.0 if heads else 0.25
+    if not 0 < minutes < float("inf"):
+        raise HeadError("--minutes", f"{minutes:g}", "give more than 0")
+    contest = headbench.Bench(
+        heads=load_folder(heads) if heads else synthetic_heads(8, 0, vertices=800),
+        unlabelled=load_folder(unlabelled) if unlabelled else (),
+        others=load_folder(others) if others else (),
+        folds=folds,
+        minutes=minutes,
+        suites=suites or headbench.ALL_SUITES,
+        methods=methods,
+    )
+    results = headbench.run(contest, out)
+    page = write_page(results, targets(results, out, OURS), out / "page")
+    print(markdown(methods_table(results)))
+    print(f"{page}: tables and figures")
+
+
 def demo(*, out: Folder = Path("demo")) -> None:
     """Skin the sample head, print the scores, write a .glb and a picture.
 
@@ -298,6 +380,7 @@ COMMANDS = {
     "skin": skin,
     "train": train,
     "evaluate": evaluate,
+    "bench": bench,
     "lab": lab,
     "demo": demo,
     "check": check,

@@ -30,9 +30,20 @@ def safe_normalize(vectors: np.ndarray, fallback=(0.0, 0.0, 0.0)) -> np.ndarray:
     return np.where(length > 0, unit, np.asarray(fallback, np.float64))
 
 
+def row_dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(N,) dot products of rows; much faster than a product and a sum over it.
+
+    >>> row_dot(np.array([[1.0, 2, 3]]), np.array([[4.0, 5, 6]])).tolist()
+    [32.0]
+    """
+    return np.einsum("ij,ij->i", a, b)
+
+
 def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(F, 3) normals whose length is twice the face's area; 0 for a flat face."""
-    a, b, c = np.asarray(vertices, np.float64)[faces].transpose(1, 0, 2)
+    vertices = np.asarray(vertices, np.float64)
+    # `take` is several times faster than an index in brackets.
+    a, b, c = (vertices.take(corner, axis=0) for corner in faces.T)
     return np.cross(b - a, c - a)
 
 
@@ -68,10 +79,12 @@ def mesh_edges(faces: np.ndarray) -> np.ndarray:
     """
     if len(faces) == 0:
         return np.zeros((0, 2), np.int64)
-    a, b = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).T
-    # One number an edge: far faster to make unique than rows.
+    start, end = faces.ravel(), faces[:, [1, 2, 0]].ravel()
+    a, b = np.minimum(start, end), np.maximum(start, end)
+    # One number an edge: far faster to sort than rows.
     size = int(faces.max()) + 1
-    key = np.unique(a[a != b] * size + b[a != b])
+    key = np.sort((a * size + b)[a != b])
+    key = key[np.diff(key, prepend=-1) > 0]
     return np.stack(np.divmod(key, size), axis=1)
 
 
@@ -133,12 +146,11 @@ def weld(vertices: np.ndarray, tolerance: float = 1e-6) -> np.ndarray:
     # Round to the bounding box's own grid: positions in one file repeat exactly or
     # differ by float32 noise, so a grid finds what a search in a ball would.
     grid = np.round((vertices - vertices.min(axis=0)) / (extent * tolerance))
-    _, first, ids = np.unique(
-        grid.astype(np.int64), axis=0, return_index=True, return_inverse=True
-    )
-    rank = np.zeros_like(first)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return rank[ids.reshape(-1)]
+    order = np.lexsort(grid.T)  # stable: the first of each position comes first
+    starts = np.diff(grid[order], axis=0, prepend=-1).any(axis=1)
+    first = np.zeros_like(order)
+    first[order] = order[starts][np.cumsum(starts) - 1]
+    return (np.cumsum(first == np.arange(len(first))) - 1)[first]
 
 
 def islands(
@@ -225,11 +237,13 @@ def curvature(
     [0.5, 0.5]
     """
     a, b = edges.T
-    step = np.asarray(vertices, np.float64)[b] - vertices[a]
-    squared = (step**2).sum(axis=1)
-    turn = np.asarray(normals, np.float64)[b] - normals[a]
+    vertices = np.asarray(vertices, np.float64)
+    normals = np.asarray(normals, np.float64)
+    step = vertices.take(b, axis=0) - vertices.take(a, axis=0)
+    turn = normals.take(b, axis=0) - normals.take(a, axis=0)
+    squared = row_dot(step, step)
     bend = np.divide(
-        (turn * step).sum(axis=1), squared, out=np.zeros(len(step)), where=squared > 0
+        row_dot(turn, step), squared, out=np.zeros(len(step)), where=squared > 0
     )
     return _edge_mean(edges, bend, len(vertices))
 
@@ -244,7 +258,8 @@ def normal_deviation(normals: np.ndarray, edges: np.ndarray) -> np.ndarray:
     [1.0, 1.0]
     """
     a, b = edges.T
-    bend = 1 - (np.asarray(normals, np.float64)[a] * normals[b]).sum(axis=1)
+    normals = np.asarray(normals, np.float64)
+    bend = 1 - row_dot(normals.take(a, axis=0), normals.take(b, axis=0))
     return _edge_mean(edges, bend, len(normals))
 
 

@@ -32,6 +32,9 @@ MAX_ELEMENTS = 2**28
 claim any size; what claims more than this is refused before memory is taken for it."""
 
 EXTRAS_KEY = "skinlib"
+CONFIDENCE = "_CONFIDENCE"
+"""The attribute that says how sure the weights of a vertex are: 0 to 1."""
+
 OUR_COLOURS = "skinlib colours"
 """The name of the accessors with colours that we wrote and may write again."""
 
@@ -774,7 +777,7 @@ def reskinned(
     _one_buffer(document)
     if not binding.skinned:
         _bind(document, binding)
-    document.recycle(_without_old(document, binding, colours is not None, attributes))
+    document.recycle(_without_old(document, binding, attributes))
     bones, values = sorted_influences(head.weights[:, columns], max_influences)
     start = 0
     for block in binding.blocks:
@@ -789,18 +792,18 @@ def reskinned(
 
 
 def _without_old(
-    document: _Document, binding: _Binding, colours: bool, replaced: Iterable[str]
+    document: _Document, binding: _Binding, replaced: Iterable[str]
 ) -> set[int]:
-    """Take off the head what will be written anew; returns the accessors it had."""
+    """Take off the head what is no longer true; returns the accessors it had."""
     accessors = set()
-    replaced = set(map(plain_name, replaced))
+    replaced = {plain_name(name) for name in (*replaced, CONFIDENCE)}
     for block in binding.blocks:
         for name, accessor_id in list(block.attributes.items()):
             ours = document.tree.accessors[accessor_id].name == OUR_COLOURS
             if (
                 name.startswith(("JOINTS_", "WEIGHTS_"))
                 or (name.startswith("_") and plain_name(name) in replaced)
-                or (name.startswith("COLOR_") and ours and colours)
+                or (name.startswith("COLOR_") and ours)
             ):
                 accessors.add(block.attributes.pop(name))
                 for primitive in block.primitives:

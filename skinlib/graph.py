@@ -11,7 +11,14 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from skinlib.geometry import islands, mesh_edges, safe_normalize, vertex_areas, weld
+from skinlib.geometry import (
+    islands,
+    mesh_edges,
+    row_dot,
+    safe_normalize,
+    vertex_areas,
+    weld,
+)
 from skinlib.head import Head
 
 MESH, SPACE = 0, 1
@@ -89,12 +96,17 @@ def seam_nodes(head: Head) -> np.ndarray:
     return connected_components(links, directed=False)[1].astype(np.int64)
 
 
-def build_graph(head: Head, config: GraphConfig | None = None) -> HybridGraph:
+def build_graph(
+    head: Head, config: GraphConfig | None = None, threads: int = 1
+) -> HybridGraph:
     """The hybrid graph of a head: O(V) time and memory.
 
     Mesh edges come first, shortest first; the places left are filled with neighbours
     in space, nearest first, that pass three gates: the same island, normals that agree,
     and a path of at most two mesh edges not much longer than the straight line.
+
+    Args:
+        threads: how many look for the neighbours in space; the graph is the same.
 
     >>> from skinlib.head import Skeleton
     >>> bone = Skeleton.from_heads_and_tails([[0, 0, 0]], None, [-1], ["head"])
@@ -118,19 +130,10 @@ def build_graph(head: Head, config: GraphConfig | None = None) -> HybridGraph:
     island = islands(faces, count)
 
     mesh, length = _mesh_table(positions, edges, config.neighbours)
-    table = np.where(np.isfinite(length), mesh, -1)
-    kinds = np.where(np.isfinite(length), MESH, -1).astype(np.int8)
-    space = _gated_nearest(positions, normals, island, mesh, length, config)
-    table, kinds = _append(table, kinds, space)
-    first = np.where(table[:, :1] >= 0, table[:, :1], np.arange(count)[:, None])
-    return HybridGraph(
-        node_of_vertex,
-        vertex_of_node,
-        np.where(kinds >= 0, table, first),
-        kinds,
-        island,
-        edges,
-    )
+    straight, candidate = _nearest(positions, config.nearest, threads)
+    passed = _gates(straight, candidate, normals, island, mesh, length, config)
+    table, kinds = _append(mesh, np.isfinite(length), candidate, passed)
+    return HybridGraph(node_of_vertex, vertex_of_node, table, kinds, island, edges)
 
 
 def node_normals(normals, node_of_vertex, count) -> np.ndarray:
@@ -147,60 +150,77 @@ def node_areas(head: Head, node_of_vertex: np.ndarray, count: int) -> np.ndarray
 def _mesh_table(positions, edges, width):
     """(N, K) mesh neighbours, shortest first, and (N, K) lengths, inf when unused."""
     count = len(positions)
-    both = np.concatenate([edges, edges[:, ::-1]])
-    length = np.linalg.norm(positions[both[:, 0]] - positions[both[:, 1]], axis=1)
-    both_order = np.lexsort((both[:, 1], length, both[:, 0]))
-    both, length = both[both_order], length[both_order]
-    degree = np.bincount(both[:, 0], minlength=count)
-    place = np.arange(len(both)) - np.repeat(np.cumsum(degree) - degree, degree)
+    a, b = edges.T
+    step = positions.take(a, axis=0) - positions.take(b, axis=0)
+    length = np.sqrt(row_dot(step, step))
+    # Edges come in the order of their ends, which stays where lengths are equal.
+    shortest = np.argsort(length, kind="stable")
+    ranked = edges.take(shortest, axis=0)
+    # By node, then by length: one number holds both, and numbers are fast to sort.
+    key = np.sort((ranked * len(edges) + np.arange(len(edges))[:, None]).ravel())
+    row, rank = np.divmod(key, max(1, len(edges)))
+    degree = np.bincount(row, minlength=count)
+    place = np.arange(len(row)) - np.repeat(np.cumsum(degree) - degree, degree)
     kept = place < width
-    row, place = both[kept, 0], place[kept]
+    row, rank, place = row[kept], rank[kept], place[kept]
     neighbours = np.repeat(np.arange(count)[:, None], width, axis=1)
     lengths = np.full((count, width), np.inf)
-    neighbours[row, place] = both[kept, 1]
-    lengths[row, place] = length[kept]
+    neighbours[row, place] = (a + b)[shortest][rank] - row  # the other end
+    lengths[row, place] = length[shortest][rank]
     return neighbours, lengths
 
 
-def _gated_nearest(positions, normals, island, mesh, length, config, chunk=512):
-    """(N, nearest + 2) nodes that pass the gates, nearest first, -1 elsewhere."""
-    count = len(positions)
-    width = min(config.nearest + 2, count)
-    if width < 2:
-        return np.full((count, 0), -1)
-    straight, candidate = cKDTree(positions).query(positions, k=width)
-    own = np.arange(count)[:, None]
+def _nearest(positions, nearest, threads):
+    """(N, nearest + 1) distances, increasing, and nodes; those not to use at inf."""
+    width = min(nearest + 2, len(positions))
+    tree = cKDTree(positions)
+    straight, candidate = tree.query(positions, k=np.arange(width) + 1, workers=threads)
     # Of neighbours equally far away take all or none, or the order of vertices decides.
-    beyond = straight[:, -1:] if width == config.nearest + 2 else np.inf
-    passed = (
-        (candidate != own)
-        & (straight < beyond * (1 - 1e-6))
-        & (island[candidate] == island[:, None])
-        & ((normals[candidate] * normals[:, None]).sum(axis=2) >= config.min_cosine)
-        & ~(mesh[:, None, :] == candidate[:, :, None]).any(axis=2)
-    )
-    for start in range(0, count, chunk):
-        rows, places = np.nonzero(passed[start : start + chunk])
-        rows += start
-        goal = candidate[rows, places]
-        # The shortest path of two mesh edges: meet at a common neighbour.
-        meet = mesh[rows][:, :, None] == mesh[goal][:, None, :]  # (P, K, K)
-        pair, out, back = np.nonzero(meet)
+    if width == nearest + 2:
+        straight[straight >= straight[:, -1:] * (1 - 1e-6)] = np.inf
+    return straight, candidate
+
+
+def _gates(straight, candidate, normals, island, mesh, length, config, chunk=2048):
+    """(N, nearest) bool: which candidates become edges."""
+    passed = np.isfinite(straight) & (candidate != np.arange(len(candidate))[:, None])
+    passed &= island[candidate] == island[:, None]
+    for neighbour in mesh.T:
+        passed &= candidate != neighbour[:, None]
+    rows, places = np.nonzero(passed)
+    goal = candidate[rows, places]
+    cosine = row_dot(normals.take(goal, axis=0), normals.take(rows, axis=0))
+
+    # The shortest path of two mesh edges: meet at a common neighbour.
+    shortest, width = np.full(len(rows), np.inf), mesh.shape[1]
+    mesh = mesh.astype(np.int32)  # half the bytes to compare
+    for start in range(0, len(rows), chunk):
+        part = slice(start, start + chunk)
+        here, there = mesh.take(rows[part], axis=0), mesh.take(goal[part], axis=0)
+        meet = here[:, :, None] == there[:, None, :]  # (P, K, K)
+        pair, place = np.divmod(np.flatnonzero(meet), width**2)
+        out, back = np.divmod(place, width)
+        pair += start
         path = length[rows[pair], out] + length[goal[pair], back]
-        shortest = np.full(len(rows), np.inf)
         np.minimum.at(shortest, pair, path)
-        far = shortest > config.max_detour * straight[rows, places]
-        passed[rows[far], places[far]] = False
-    return np.where(passed, candidate, -1)
+    near = shortest <= config.max_detour * straight[rows, places]
+    passed[rows, places] = near & (cosine >= config.min_cosine)
+    return passed
 
 
-def _append(table, kinds, extra):
-    """Fill the unused places of `table` with the used ones of `extra`."""
-    width = table.shape[1]
-    table = np.concatenate([table, extra], axis=1)
-    kinds = np.concatenate([kinds, np.where(extra >= 0, SPACE, -1)], axis=1)
-    order = np.argsort(table < 0, axis=1, kind="stable")[:, :width]
-    return (
-        np.take_along_axis(table, order, axis=1),
-        np.take_along_axis(kinds, order, axis=1).astype(np.int8),
-    )
+def _append(mesh, used, candidate, passed):
+    """(N, K) neighbours and kinds: of the mesh, then those that passed, then filling.
+
+    The used places of `mesh` come first in a row.
+    """
+    count, width = mesh.shape
+    number = used.sum(axis=1)
+    place = number[:, None] + np.cumsum(passed, axis=1) - 1
+    row, which = np.nonzero(passed & (place < width))
+    place = place[row, which]
+    kinds = np.where(used, MESH, -1).astype(np.int8)
+    kinds[row, place] = SPACE
+    table = mesh.copy()
+    table[row, place] = candidate[row, which]
+    first = np.where(kinds[:, 0] >= 0, table[:, 0], np.arange(count))
+    return np.where(kinds >= 0, table, first[:, None]), kinds

@@ -1,13 +1,15 @@
-"""Heads in and out of files: `.npz` and skinned glTF 2.0 (`.glb`, and `.gltf` to read).
+"""Heads in and out of files: `.npz`, skinned glTF 2.0 (`.glb`, and `.gltf` to read)
+and, where Blender is at hand, `.blend` and `.fbx`.
 
 A `.npz` holds the arrays of the data contract under the names in `NPZ_KEYS`; what is
-read of a glTF file, and how, is told in `skinlib.gltf`.
+read of the others, and how, is told in `skinlib.gltf` and `skinlib.blender.files`.
 """
 
 import contextlib
 import math
 import os
 import re
+import tempfile
 import uuid
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
@@ -17,6 +19,8 @@ from typing import BinaryIO
 import numpy as np
 
 from skinlib import gltf
+from skinlib.blender.files import SCENES, glb_to_scene, npz_to_scene, scene_to_npz
+from skinlib.blender.run import find_blender
 from skinlib.head import Head, HeadError, Skeleton
 
 NPZ_KEYS = (
@@ -37,7 +41,9 @@ LOCKED = "_LOCKED"
 
 
 def read_head(path: str | Path, weights: bool = True) -> Head:
-    """Read a head from a `.npz`, `.glb` or `.gltf` file; its name is the file's stem.
+    """Read a head from a `.npz`, `.glb`, `.gltf`, `.blend` or `.fbx` file.
+
+    Its name is the file's stem.
 
     Args:
         weights: False passes the file's weights over, so that a head that is only
@@ -47,6 +53,7 @@ def read_head(path: str | Path, weights: bool = True) -> Head:
         HeadError: the file cannot be read, or what it holds is not a head.
     """
     readers = {".npz": read_npz, ".glb": read_glb, ".gltf": read_glb}
+    readers |= dict.fromkeys(SCENES, read_blender)
     return _by_suffix(readers, path)(path, weights)
 
 
@@ -66,6 +73,7 @@ def read_vertex_mask(path: str | Path, name: str = LOCKED) -> np.ndarray:
     """
     readers = {".npz": _npz_attribute, ".glb": gltf.read_attribute}
     readers[".gltf"] = gltf.read_attribute
+    readers |= dict.fromkeys(SCENES, _blender_attribute)
     read, path = _by_suffix(readers, path), _existing_file(path)
     with _malformed(path, "write or export it again"):
         values = read(path, name)
@@ -85,35 +93,37 @@ def write_head(
     colours: np.ndarray | None = None,
     attributes: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Write a head to a `.npz` or `.glb` file; the file appears whole or not at all.
+    """Write a head to a `.npz`, `.glb`, `.blend` or `.fbx` file, whole or not at all.
 
     Args:
         path: where to; a file that is there already is replaced.
         head: what to write.
-        source: a `.glb` file to re-skin: everything in it is kept (materials, morph
-            targets, animations, other meshes, ...) and the weights of `head` are put
-            on its mesh. `head` must have its vertices and its bones.
+        source: a `.glb`, `.blend` or `.fbx` file to re-skin: everything in it is kept
+            (materials, morph targets, animations, other meshes, ...) and the weights
+            of `head` are put on its mesh. `head` must have its vertices and its bones.
         max_influences: keep this many of a vertex's largest weights; None keeps all.
         colours: (V, 3) or (V, 4), from 0 to 1, linear RGB or RGBA: COLOR_0 of a `.glb`,
-            or the next COLOR_n where the artist has painted (what was written so
-            before is replaced); the field `colours` of a `.npz`.
+            or the next COLOR_n where the artist has painted; the field `colours` of a
+            `.npz`. What an earlier call wrote so, and `_CONFIDENCE`, goes in any case.
         attributes: (V,) numbers by name, such as `_CONFIDENCE`, which Blender shows
             under that name; the field `confidence` of a `.npz`.
 
     Raises:
         HeadError: the file cannot be written, or `head` does not fit `source`.
     """
-    write = _by_suffix({".npz": write_npz, ".glb": write_glb}, path)
+    write = _by_suffix(WRITERS, path)
     options = (max_influences, colours, attributes)
     if source is None:
         write(path, head, *options)
-    elif write is write_glb:
-        write_glb(path, head, *options, source=source)
+    elif write is not write_npz:
+        if Path(source).suffix.lower() in SCENES:
+            write = write_blender
+        write(path, head, *options, source=source)
     else:
         raise HeadError(
             "file",
             f"the source {source} cannot be re-skinned into a .npz file",
-            "give the output a name that ends in .glb, or leave the source out",
+            "give the output the ending of the source, or leave the source out",
             path,
         )
 
@@ -122,9 +132,11 @@ def check_target(path: str | Path) -> None:
     """Tell before long work what would keep `write_head` from writing.
 
     Raises:
-        HeadError: a wrong ending, or a folder that cannot be written to.
+        HeadError: a wrong ending, a folder that cannot be written to, or no Blender
+            where one is needed.
     """
-    _by_suffix({".npz": write_npz, ".glb": write_glb}, path)
+    if _by_suffix(WRITERS, path) is write_blender:
+        find_blender()
     folder = Path(path).parent
     if not folder.is_dir() or not os.access(folder, os.W_OK):
         raise HeadError(
@@ -332,6 +344,71 @@ def write_glb(
             content = gltf.reskinned(source, head, max_influences, colours, attributes)
     with atomic(path) as file:
         file.write(content)
+
+
+# --- .blend and .fbx ----------------------------------------------------------------
+
+
+def read_blender(path: str | Path, weights: bool = True) -> Head:
+    """Read a head from a `.blend` or `.fbx` file, as `scene_to_npz` says.
+
+    Raises:
+        HeadError: no Blender, or a file that it cannot open or that holds no head.
+    """
+    path = _existing_file(path)
+    with _exchange(path) as npz:
+        scene_to_npz(path, npz)
+        return read_npz(npz, weights).replace(name=path.stem)
+
+
+def _blender_attribute(path: Path, name: str) -> np.ndarray:
+    """(V,) bool: what the vertex group or attribute `_LOCKED` marks."""
+    with _exchange(path) as npz:
+        scene_to_npz(path, npz)
+        return _npz_attribute(npz, name)
+
+
+def write_blender(
+    path: str | Path,
+    head: Head,
+    max_influences: int | None = None,
+    colours: np.ndarray | None = None,
+    attributes: Mapping[str, np.ndarray] | None = None,
+    source: str | Path | None = None,
+) -> None:
+    """Write a head to a `.blend` or `.fbx` file, or into a scene; see `write_head`.
+
+    Raises:
+        HeadError: no Blender, the head does not fit `source`, or the file cannot be
+            written.
+    """
+    path = Path(path)
+    options = (max_influences, colours, attributes)
+    source = None if source is None else _existing_file(source)
+    with _exchange(path) as npz:
+        if source is not None and source.suffix.lower() not in SCENES:
+            write_glb(npz.with_suffix(".glb"), head, *options, source=source)
+            glb_to_scene(npz.with_suffix(".glb"), path)
+        else:
+            write_npz(npz, head, *options)
+            npz_to_scene(npz, path, source)
+
+
+@contextlib.contextmanager
+def _exchange(path: Path) -> Iterator[Path]:
+    """A `.npz` to hand over to Blender; what is wrong with it is wrong with `path`."""
+    with tempfile.TemporaryDirectory(prefix="skinlib_") as folder:
+        npz = Path(folder, "head.npz")
+        try:
+            yield npz
+        except HeadError as error:
+            if error.file != str(npz):
+                raise
+            raise HeadError(error.field, error.found, error.fix, path) from error
+
+
+WRITERS = {".npz": write_npz, ".glb": write_glb}
+WRITERS |= dict.fromkeys(SCENES, write_blender)
 
 
 # --- files --------------------------------------------------------------------------

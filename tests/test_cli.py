@@ -67,7 +67,8 @@ def skin(run, *args) -> np.ndarray:
     "command, words",
     [
         ("skin", "IN OUT --checkpoint --painted --max-influences --lock --symmetric"),
-        ("skin", "--lock-vertices ATTRIBUTE _LOCKED --smooth"),
+        ("skin", "--lock-vertices ATTRIBUTE _LOCKED --smooth --confidence"),
+        ("bench", "--heads --out --unlabelled --others --folds --minutes --suites"),
         ("train", "--labelled --unlabelled --out --minutes --seed --device --start"),
         ("evaluate", "--heads --train-heads --checkpoint --json row-L1"),
         ("lab", "--port --no-browser Ctrl-C"),
@@ -213,6 +214,40 @@ def test_smooth(run):
     np.testing.assert_allclose(smooth, expected, atol=1e-6)
 
 
+def test_confidence_is_painted_and_goes_when_it_is_no_longer_true(run, place, capsys):
+    plain = skin(run, "skinned.glb", "plain.glb")
+    sure = skin(run, "skinned.glb", "sure.glb", "--confidence")
+    np.testing.assert_allclose(sure, plain, atol=1e-5)
+    assert "of the vertices are rather wrong than not" in capsys.readouterr().out
+    file = pygltflib.GLTF2().load("sure.glb")
+    attributes = vars(file.meshes[0].primitives[0].attributes)
+    values = gltf.read_attribute(place / "sure.glb", "_CONFIDENCE")
+    # The colour is white as far as the number says.
+    red, green, blue, _ = colour_bytes(file, attributes["COLOR_0"]).T
+    np.testing.assert_allclose(green, 255 * values, atol=0.51)
+    assert (red == 255).all() and (green == blue).all()
+    assert 0 <= values.min() < values.max() <= 1
+    # New weights without a new confidence.
+    skin(run, "sure.glb", "again.glb")
+    primitive = pygltflib.GLTF2().load("again.glb").meshes[0].primitives[0]
+    assert primitive.attributes.COLOR_0 is None
+    assert "_CONFIDENCE" not in vars(primitive.attributes)
+
+
+def colour_bytes(file: pygltflib.GLTF2, accessor: int) -> np.ndarray:
+    accessor = file.accessors[accessor]
+    view = file.bufferViews[accessor.bufferView]
+    start = (view.byteOffset or 0) + (accessor.byteOffset or 0)
+    data = np.frombuffer(file.binary_blob(), "u1", 4 * accessor.count, start)
+    return data.reshape(-1, 4)
+
+
+def test_an_artist_s_own_vertices_are_sure(run):
+    command = ("full.npz", "out.npz", "--confidence", "--lock-vertices", "_LOCKED")
+    skin(run, *command)
+    assert (np.load("out.npz")["confidence"] == 1).all()
+
+
 # ---------------------------------------------------------------------- train, evaluate
 
 
@@ -277,7 +312,7 @@ def test_evaluate_writes_the_table_and_the_numbers(run, capsys):
     "command, message",
     [
         ("skin no.glb out.glb", "no.glb: file"),
-        ("skin bare.npz out.fbx", "out.fbx"),
+        ("skin bare.npz out.obj", "out.obj"),
         ("skin bare.npz out.npz --checkpoint no/where", "no/where"),
         ("skin bare.npz out.npz --checkpoint network --painted bare", "has none"),
         ("skin bare.npz out.npz --checkpoint network --painted no", "no: folder"),

@@ -684,10 +684,12 @@ def test_the_artists_colours_stay_and_ours_are_written_anew(tmp_path):
     ours = floats(tree, blob, "COLOR_1")[:, :3]
     np.testing.assert_allclose(ours, 1 - COLOURS, atol=0.002)
     np.testing.assert_array_equal(floats(tree, blob, "_CONFIDENCE"), 1 - SURE)
-    # Without new ones they stay, as all else does.
+    # Without new ones they go: they told of other weights.
     write_head(path, head, source=path)
     tree, blob = unpack(path)
-    np.testing.assert_array_equal(floats(tree, blob, "COLOR_1")[:, :3], ours)
+    attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+    assert "COLOR_1" not in attributes and "_CONFIDENCE" not in attributes
+    np.testing.assert_array_equal(floats(tree, blob, "COLOR_0"), painted)
 
 
 def two_parts(**second) -> Builder:
@@ -1113,7 +1115,7 @@ def test_files_that_are_not_there_or_not_ours(tmp_path):
     for name, words in {
         "none.glb": "there is no such file",
         "folder.glb": "it is a folder",
-        "head.fbx": r"ends in '\.fbx'\. Use one of \.npz, \.glb",
+        "head.obj": r"ends in '\.obj'\. Use one of \.npz, \.glb",
         "head": "the name has no ending",
         "empty.glb": "malformed",
         "empty.npz": "not a .npz archive",
@@ -1158,7 +1160,7 @@ def test_places_that_cannot_be_written(tmp_path):
         "none/head.glb": "cannot be written",
         "file/head.npz": "cannot be written",
         "folder.glb": "it is a folder",
-        "head.fbx": "ends in '.fbx'",
+        "head.obj": "ends in '.obj'",
         "head.gltf": "ends in '.gltf'",
     }.items():
         with pytest.raises(HeadError, match=words):

@@ -382,3 +382,22 @@ def test_a_chain_deeper_than_the_embedding(count):
     assert chain.depths.max() == count - 1 and (count < 3 or count > MAX_DEPTH)
     encoded = SkeletonEncoder(8)(chain)
     assert encoded.shape == (count, 8) and encoded.isfinite().all()
+
+
+# ---------------------------------------------------------------- kinds of numbers
+
+
+def test_layers_run_in_bfloat16(table):
+    x, areas, island = torch.randn(N, 8), torch.rand(N) + 0.1, torch.arange(N) % 2
+    layers = (EdgeConv(8, 8), InducedTransformer(8, points=3, heads=2))
+    inputs = ((table,), (areas,))
+    with torch.no_grad():
+        for layer, rest in zip(layers, inputs, strict=True):
+            exact = layer(x, *rest)
+            with torch.autocast("cpu", torch.bfloat16):
+                rounded = layer(x, *rest)
+            torch.testing.assert_close(rounded.float(), exact, atol=0.1, rtol=0.1)
+        exact = island_mean(x, island, areas)
+        with torch.autocast("cpu", torch.bfloat16):
+            rounded = island_mean(x.bfloat16(), island, areas)
+        torch.testing.assert_close(rounded.float(), exact, atol=0.05, rtol=0.05)

@@ -1,4 +1,4 @@
-"""Heads of your own: a folder of `.npz`, `.glb` and `.gltf` files."""
+"""Heads of your own: a folder of files that `skinlib.io.read_head` reads."""
 
 import itertools
 from pathlib import Path
@@ -8,7 +8,7 @@ from tqdm.auto import tqdm
 from skinlib.head import Head, HeadError
 from skinlib.io import read_head
 
-SUFFIXES = {".npz", ".glb", ".gltf"}
+SUFFIXES = {".npz", ".glb", ".gltf", ".blend", ".fbx"}
 
 
 def load_folder(directory: str | Path) -> list[Head]:

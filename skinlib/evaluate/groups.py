@@ -92,7 +92,7 @@ def fold(heads: Sequence[Head], number: int) -> tuple[list[Head], list[Head]]:
     Raises:
         HeadError: nothing is held out, or nothing is left to train on.
     """
-    groups = np.array(topology_groups(heads, STRICT))
+    groups = np.array(topology_groups(heads, STRICT), np.int64)
     sizes = np.bincount(groups)
     small = np.flatnonzero(sizes <= max(1, len(heads) / 4))
     held_out = np.isin(groups, small[number::FOLDS])

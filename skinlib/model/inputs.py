@@ -122,8 +122,8 @@ def content_hash(head: Head, config: GraphConfig) -> str:
 
 
 def _prepare(head, config):
-    graph = build_graph(head, config)
-    return mesh_input(head, graph), skeleton_input(head)
+    graph, frame = build_graph(head, config, torch.get_num_threads()), bone_frame(head)
+    return mesh_input(head, graph, frame), skeleton_input(head, frame)
 
 
 def bone_frame(head: Head) -> Frame:
@@ -146,9 +146,9 @@ def bone_frame(head: Head) -> Frame:
     return Frame(frame.rotation, centre, scale)
 
 
-def mesh_input(head: Head, graph) -> MeshInput:
+def mesh_input(head: Head, graph, frame: Frame | None = None) -> MeshInput:
     """The mesh half; `graph` may come from an earlier pose of the same mesh."""
-    frame = bone_frame(head)
+    frame = frame or bone_frame(head)
     positions = frame.apply(head.vertices[graph.vertex_of_node])
     normals = node_normals(head.normals, graph.node_of_vertex, len(graph))
     normals = frame.rotate(normals)
@@ -170,9 +170,9 @@ def mesh_input(head: Head, graph) -> MeshInput:
     )
 
 
-def skeleton_input(head: Head) -> SkeletonInput:
+def skeleton_input(head: Head, frame: Frame | None = None) -> SkeletonInput:
     """The skeleton half."""
-    frame, skeleton = bone_frame(head), head.skeleton
+    frame, skeleton = frame or bone_frame(head), head.skeleton
     return SkeletonInput(
         _float(np.clip(frame.apply(skeleton.joints), -FAR, FAR)),
         _float(frame.rotate(skeleton.directions)),

@@ -239,6 +239,7 @@ def island_mean(x: Tensor, island: Tensor, areas: Tensor) -> Tensor:
     """
     count = int(island.max()) + 1
     mass = areas.clamp(min=1e-4)[:, None]
-    total = x.new_zeros(count, x.shape[1]).index_add(0, island, x * mass)
-    sums = x.new_zeros(count, 1).index_add(0, island, mass)
-    return (total / sums)[island]
+    heavy = x * mass  # in float32, when autocast has made x smaller
+    total = heavy.new_zeros(count, x.shape[1]).index_add(0, island, heavy)
+    sums = mass.new_zeros(count, 1).index_add(0, island, mass)
+    return (total / sums).index_select(0, island)

@@ -12,11 +12,23 @@ from torch import Tensor
 from skinlib.graph import GraphConfig
 from skinlib.head import HeadError
 from skinlib.model import ModelConfig, SkinningModel
+from skinlib.model.rivals import (
+    PointTransformer,
+    PointTransformerConfig,
+    RigNetConfig,
+    RigNetSkinning,
+)
 from skinlib.paths import checkpoint
 
 STATE = "training.safetensors"
 WEIGHTS = "model.safetensors"
 CONFIG = "config.json"
+# By the name in a checkpoint: what was saved without one is skinlib's own.
+NETWORKS = {
+    "skinlib": (SkinningModel, ModelConfig),
+    "rignet": (RigNetSkinning, RigNetConfig),
+    "point_transformer": (PointTransformer, PointTransformerConfig),
+}
 
 
 def save_model(model: SkinningModel, folder: str | Path, extra: dict) -> None:
@@ -24,7 +36,9 @@ def save_model(model: SkinningModel, folder: str | Path, extra: dict) -> None:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     tensors = {k: v.cpu().contiguous() for k, v in model.state_dict().items()}
-    config = json.dumps({"model": model.describe()} | extra, indent=1)
+    names = {kind: name for name, (kind, _) in NETWORKS.items()}
+    own = {"network": names[type(model)], "model": model.describe()}
+    config = json.dumps(own | extra, indent=1)
     # The weights carry their own configuration, so the two files cannot disagree.
     write_tensors(folder / WEIGHTS, tensors, {"config": config})
     replace_file(folder / CONFIG, f"{config}\n".encode())
@@ -55,9 +69,11 @@ def load_model(name: str | Path) -> SkinningModel:
         )
     tensors, metadata = read_tensors(path)
     try:
-        settings = json.loads(metadata["config"])["model"]
-        config = ModelConfig(**(settings | {"graph": GraphConfig(**settings["graph"])}))
-        model = SkinningModel(config)
+        stored = json.loads(metadata["config"])
+        settings = stored["model"]
+        kind, config = NETWORKS[stored.get("network", "skinlib")]
+        graph = GraphConfig(**settings["graph"])
+        model = kind(config(**(settings | {"graph": graph})))
         model.load_state_dict(tensors)
     except (ArithmeticError, LookupError, TypeError, ValueError, RuntimeError) as error:
         raise HeadError(

@@ -31,6 +31,7 @@ from skinlib.evaluate.metrics import row_l1
 from skinlib.graph import HybridGraph, build_graph
 from skinlib.head import Head, HeadError
 from skinlib.model import Critic, SkinningModel
+from skinlib.model.confidence import fit_calibration
 from skinlib.model.inputs import content_hash, mesh_input, skeleton_input
 from skinlib.training import parallel
 from skinlib.training.checkpoint import (
@@ -67,7 +68,8 @@ def train(
             validation on.
         unlabelled: heads whose weights the averaged model guesses while it learns.
         validation: heads to judge by; None holds out whole topology groups.
-        start: a model to begin from, such as a shipped checkpoint.
+        start: a model to begin from, such as a shipped checkpoint, or a new one of
+            another architecture, which `config.model` then says nothing about.
 
     Raises:
         HeadError: a head without weights, or `out` holds another run.
@@ -107,7 +109,8 @@ class Trainer:
         self.carried = self._carry()
 
         torch.manual_seed(config.seed)
-        self.model = SkinningModel(start.config if start else config.model)
+        network = type(start) if start else SkinningModel
+        self.model = network(start.config if start else config.model)
         if start:
             self.model.load_state_dict(start.state_dict())
         self.model.to(config.device)
@@ -167,6 +170,10 @@ class Trainer:
         if not self.history or self.history[-1]["step"] != self.steps_done:
             self.validate()
         self.save()
+        if self.validation and parallel.is_first():
+            words = "the heads that this run was validated by"
+            model = load_model(self.out)
+            fit_calibration(model, self.validation, fitted_on=words).write(self.out)
         parallel.wait()  # for the process that writes
         return load_model(self.out).to(self.config.device)
 
@@ -473,6 +480,9 @@ class Trainer:
         """What has to be the same for a run to be the same."""
         machine = ("threads", "device", "save_seconds")
         settings = {k: v for k, v in asdict(self.config).items() if k not in machine}
+        if type(self.model) is not SkinningModel:
+            settings["model"] = {"network": type(self.model).__name__}
+            settings["model"] |= self.model.describe()
         graph = self.model.config.graph
         groups = {
             "labelled": self.labelled,
