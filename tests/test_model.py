@@ -10,7 +10,8 @@ from shapes import axis_rotations, bumpy, moved, skeleton, sphere, unwelded
 from skinlib import Head, Skeleton
 from skinlib.datasets.synthetic import synthetic_head
 from skinlib.graph import GraphConfig, build_graph
-from skinlib.model import ModelConfig, SkinningModel, prepare
+from skinlib.model import ModelConfig, SkinningModel, prepare, skinning_model
+from skinlib.model.confidence import predict_with_confidence
 from skinlib.model.cross_attention import CrossAttention, pair_features
 from skinlib.model.inputs import MeshInput, SkeletonInput, bone_frame, content_hash
 from skinlib.model.mesh_encoder import MeshEncoder, mesh_features
@@ -386,3 +387,20 @@ def test_the_same_seed_makes_the_same_model_and_prediction():
     assert ModelConfig(**SMALL).graph == GraphConfig()
     described = one.describe()
     assert described["mesh_width"] == 16 and described["graph"]["nearest"] == 8
+
+
+def test_a_very_fine_head_is_skinned_on_a_coarse_copy(monkeypatch):
+    model, head = build(), synthetic_head(4, 3000)
+    exact = model.predict(head, prune=0)
+    monkeypatch.setattr(skinning_model, "FINE", 2000)
+    monkeypatch.setattr(skinning_model, "COARSE", 1500)
+    seen = []
+    monkeypatch.setattr(
+        model, "forward", lambda *args, of=model.forward: seen.append(args) or of(*args)
+    )
+    coarse = model.predict(head, prune=0)
+    assert len(seen[0][0].node_of_vertex) < 2000
+    check(coarse, head)
+    assert np.abs(coarse - exact).sum(axis=1).mean() < 0.3
+    weights, sure = predict_with_confidence(model, head)
+    assert weights.shape == exact.shape and sure.shape == (len(exact),)

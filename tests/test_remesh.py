@@ -8,6 +8,8 @@ from trimesh.triangles import points_to_barycentric
 from skinlib import Head, HeadError, Skeleton
 from skinlib.datasets.remesh import (
     REMESHERS,
+    another_mesh,
+    coarsen,
     halve,
     isotropic,
     shuffle,
@@ -299,3 +301,38 @@ def test_transfer_prefers_the_side_that_faces_the_same_way(mouth):
 def test_transfer_from_an_unlabelled_head_is_refused(mouth):
     with pytest.raises(HeadError, match="weights: there are none"):
         transfer_weights(mouth.replace(weights=None), mouth.vertices, mouth.normals)
+
+
+def test_another_mesh_is_another_one_each_time():
+    head = synthetic_head(3, 1500)
+    meshes = [another_mesh(head, np.random.default_rng(seed)) for seed in range(6)]
+    sizes = [len(mesh.vertices) for mesh in meshes]
+    assert len(set(sizes)) == 6 and min(sizes) > 300 and max(sizes) < 4000
+    again = another_mesh(head, np.random.default_rng(0))
+    assert np.array_equal(again.vertices, meshes[0].vertices)
+    cloud = Head.create(head.vertices, np.zeros((0, 3), int), head.skeleton)
+    assert another_mesh(cloud, np.random.default_rng(0)) is cloud
+
+
+def test_what_is_linear_comes_back_from_a_coarse_head(heads):
+    for head in heads:
+        coarse, back = coarsen(head, 900)
+        assert 0.8 * 900 < len(coarse.vertices) < 1.6 * 900
+        assert back.shape == (len(head.vertices), len(coarse.vertices))
+        assert back.min() >= 0
+        np.testing.assert_allclose(back.sum(axis=1), 1, atol=1e-6)
+        # Positions themselves, but for the bumps that the coarse mesh has not.
+        box = np.linalg.norm(np.ptp(head.vertices, axis=0))
+        off = np.linalg.norm(back @ coarse.vertices - head.vertices, axis=1)
+        assert off.mean() < 0.005 * box and off.max() < 0.08 * box
+
+
+def test_nothing_comes_back_from_the_other_lip(mouth):
+    fine = subdivide(subdivide(mouth))
+    coarse, back = coarsen(fine, 1500)
+    # The upper lip and the lower one are far apart along the surface, by u.
+    side = transfer_weights(fine, coarse.vertices, coarse.normals)[:, 0]
+    came = back @ side
+    sure = np.isin(fine.weights[:, 0], (0, 1))
+    assert np.abs(came[sure] - fine.weights[sure, 0]).max() < 0.25
+    assert np.abs(came - fine.weights[:, 0]).mean() < 0.02

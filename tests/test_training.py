@@ -89,6 +89,38 @@ def interrupt_at(monkeypatch, step: int) -> None:
     monkeypatch.setattr(Trainer, "step", interrupted)
 
 
+# ---------------------------------------------------------------- copies
+
+
+def test_copies_have_other_meshes_and_are_drawn_as_often_as_asked(heads, tmp_path):
+    config = replace(CONFIG_OF_TESTS, remeshed=2, remeshed_share=0.75)
+    trainer = Trainer(config, heads[:2], tmp_path, validation=[])
+    own = {len(head.vertices) for head in heads[:2]}
+    sizes = []
+    for draw in range(80):
+        head, graph, labelled, known = trainer._draw(draw, np.random.default_rng(draw))
+        assert (
+            labelled and known.all() and graph.node_of_vertex.size == len(head.vertices)
+        )
+        sizes.append(len(head.vertices))
+    copied = np.mean([size not in own for size in sizes])
+    assert 0.6 < copied < 0.9
+    assert set(trainer.copies) == {(0, 0), (0, 1), (1, 0), (1, 1)}
+    for (place, _), (head, _) in trainer.copies.items():
+        assert head.skeleton is heads[place].skeleton
+        np.testing.assert_allclose(head.weights.sum(axis=1), 1, atol=1e-5)
+
+
+def test_a_run_with_copies_goes_on_to_the_same_bits(heads, tmp_path, monkeypatch):
+    config = replace(CONFIG_OF_TESTS, remeshed=2)
+    train(config, heads[:2], tmp_path / "whole", validation=[])
+    interrupt_at(monkeypatch, 5)
+    with pytest.raises(KeyboardInterrupt):
+        train(config, heads[:2], tmp_path / "stopped", validation=[])
+    train(config, heads[:2], tmp_path / "stopped", validation=[])
+    assert same_tensors(*(tmp_path / n / WEIGHTS for n in ("whole", "stopped")))
+
+
 # ---------------------------------------------------------------- it learns
 
 

@@ -14,7 +14,7 @@ linear in V, up to a logarithm.
 from collections.abc import Callable
 
 import numpy as np
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 from trimesh.remesh import subdivide as midpoint_subdivide
@@ -32,6 +32,7 @@ from skinlib.head import Head, HeadError
 
 SEAM_COSINE = 0.5  # seam vertices have normals less than 60 degrees apart; lips more
 SEAM_WEIGHTS = 0.1  # and weights no further apart than this, in row-L1
+LARGEST = 8000  # vertices that `another_mesh` makes
 ISLAND_CELLS = 12  # a small island keeps at least so many vertices
 _TINY = 1e-30  # keeps what has no area or no length from dividing by zero
 
@@ -117,6 +118,67 @@ def isotropic(
     return shuffle(_carried(source, centres, faces, cell), rng)
 
 
+def another_mesh(head: Head, rng: np.random.Generator) -> Head:
+    """One of `halve` and `isotropic`, at random, with a random number of vertices.
+
+    A head without faces has no other mesh and comes back as it is.
+    """
+    if len(head.faces) == 0:
+        return head
+    if rng.random() < 0.5:
+        return halve(head, rng, keep=rng.uniform(0.25, 0.9))
+    count = len(head.vertices) * np.exp(rng.uniform(*np.log([0.4, 2])))
+    return isotropic(head, rng, vertices=round(min(count, LARGEST)))
+
+
+def coarsen(head: Head, vertices: int) -> tuple[Head, csr_matrix]:
+    """The head with about `vertices` vertices, evenly spread, and the way back.
+
+    What is computed on the coarse head comes back by interpolation on its triangles.
+    A vertex reads only triangles around the geodesic Voronoi cell that it lies in: not
+    those of the other lip, however close.
+
+    Returns:
+        The coarse head, without weights, W vertices; (V, W) matrix, rows sum to 1,
+        that takes values at its vertices to the vertices of `head`.
+
+    Raises:
+        HeadError: no faces.
+    """
+    source, copy_of = _closed_seams(head)
+    vertices = min(vertices, len(source.vertices))
+    cell = _voronoi_cells(source, vertices, np.random.default_rng(0), iterations=2)
+    corners = cell[source.faces]
+    a, b, c = corners.T
+    corners = corners[(a != b) & (b != c) & (c != a)]
+    _, once = np.unique(np.sort(corners, axis=1), axis=0, return_index=True)
+    coarse = Head.create(
+        _means(
+            source.vertices, vertex_areas(source.vertices, source.faces) + _TINY, cell
+        ),
+        corners[once],
+        head.skeleton,
+        name=head.name,
+    )
+
+    count = len(coarse.vertices)
+    corner = np.argsort(coarse.faces, axis=None, kind="stable")
+    uses = np.bincount(coarse.faces.ravel(), minlength=count)
+    # For each vertex, the triangles around its cell, one after the other.
+    repeats = uses[cell]
+    vertex = np.repeat(np.arange(len(cell)), repeats)
+    place = np.arange(len(vertex)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
+    face = corner[(np.cumsum(uses) - uses)[cell[vertex]] + place] // 3
+    found, face, share = _nearest_face(coarse, source.vertices, vertex, face)
+    # A cell without triangles, in a thin strip, speaks for itself.
+    alone = np.flatnonzero(repeats == 0)
+    rows = np.concatenate([np.repeat(found, 3), alone])
+    columns = np.concatenate([coarse.faces[face].ravel(), cell[alone]])
+    values = np.concatenate([share.ravel(), np.ones(len(alone))])
+    back = csr_matrix((values, (rows, columns)), (len(cell), count), np.float32)
+    return coarse, back[copy_of]
+
+
 def transfer_weights(
     source: Head, points: np.ndarray, normals: np.ndarray, max_angle: float = 75.0
 ) -> np.ndarray:
@@ -180,6 +242,20 @@ def _closest(source: Head, points, point, face, penalty=None):
     Returns the ids of points with a candidate, sorted, their closest surface points
     and the weights interpolated there.
     """
+    point, face, share = _nearest_face(source, points, point, face, penalty)
+    corners = source.faces[face]  # (N, 3)
+    closest = np.einsum("nc,ncx->nx", share, source.vertices[corners])
+    if source.weights is None:
+        return point, closest, None
+    return point, closest, np.einsum("nc,ncj->nj", share, source.weights[corners])
+
+
+def _nearest_face(source: Head, points, point, face, penalty=None):
+    """Of the candidate pairs (point[i], face[i]), the closest one for each point.
+
+    Returns the ids of points with a candidate, sorted, their faces, and the barycentric
+    coordinates (N, 3) of the closest point there.
+    """
     triangles = source.vertices[source.faces[face]].astype(np.float64)
     closest = closest_point(triangles, points[point])
     distance = ((closest - points[point]) ** 2).sum(axis=1)
@@ -187,15 +263,12 @@ def _closest(source: Head, points, point, face, penalty=None):
     order = np.lexsort(keys)
     point, first = np.unique(point[order], return_index=True)
     best = order[first]
-    if source.weights is None:
-        return point, closest[best], None
-    share = points_to_barycentric(triangles[best], closest[best], method="cross")
     # A triangle without area has no such coordinates: take its first corner.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = points_to_barycentric(triangles[best], closest[best], method="cross")
     share = np.where(np.isfinite(share).all(axis=1, keepdims=True), share, [1, 0, 0])
     share = np.clip(share, 0, None)
-    share /= share.sum(axis=1, keepdims=True)
-    corners = source.weights[source.faces[face[best]]]  # (N, 3, J)
-    return point, closest[best], np.einsum("nc,ncj->nj", share, corners)
+    return point, face[best], share / share.sum(axis=1, keepdims=True)
 
 
 def _midpoints(head: Head) -> Head:
@@ -215,9 +288,14 @@ def _midpoints(head: Head) -> Head:
 
 
 def _without_seams(head: Head) -> Head:
+    return _closed_seams(head)[0]
+
+
+def _closed_seams(head: Head) -> tuple[Head, np.ndarray]:
     """Close seams: the same position twice, with like normals and like weights.
 
-    Lips that touch share positions too, but their normals oppose each other.
+    Lips that touch share positions too, but their normals oppose each other. Returns
+    the closed head and (V,), which of its vertices each vertex has become.
     """
     place = weld(head.vertices)
     order = np.argsort(place, kind="stable")
@@ -239,7 +317,7 @@ def _without_seams(head: Head) -> Head:
         weights=None if head.weights is None else head.weights[first],
     )
     _needs_faces(closed)
-    return closed
+    return closed, ids
 
 
 def _voronoi_cells(head: Head, count: int, rng, iterations: int = 6) -> np.ndarray:

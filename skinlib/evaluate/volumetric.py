@@ -40,7 +40,7 @@ def voxel_geodesic(
 
     w_vj ~ ((1 - a) d + a d^2)^-2 with a = `falloff` and d the distance from vertex v to
     bone j through the solid, as a share of the longest side of the bounding box. See
-    `skinlib.voxels.voxel_bone_distances`.
+    `skinlib.voxels.voxel_bone_distances`. Equation `voxel_geodesic`.
 
     Args:
         resolution: voxels along that side.

@@ -21,7 +21,7 @@ from skinlib.datasets.augment import mirror, warp
 from skinlib.graph import build_graph
 from skinlib.head import Head, HeadError, Skeleton
 from skinlib.model.inputs import FAR, bone_frame, mesh_input, skeleton_input
-from skinlib.model.skinning_model import SkinningModel
+from skinlib.model.skinning_model import SkinningModel, working_size
 from skinlib.painting import prune
 from skinlib.paths import DEFAULT_CHECKPOINT, checkpoint
 from skinlib.skinning import mirror_pairs
@@ -269,6 +269,7 @@ def doubt(weights: np.ndarray, other: np.ndarray) -> np.ndarray:
     """(V,) sqrt(g d): Gini impurity g = 1 - sum_j w_j^2, row-L1 d to a second opinion.
 
     0 where one bone has all the weight or both opinions agree, at most sqrt(2).
+    Equation `doubt`.
 
     >>> doubt(np.array([[0.5, 0.5], [1, 0]]), np.array([[0.25, 0.75], [1, 0]])).tolist()
     [0.5, 0.0]
@@ -281,12 +282,14 @@ def doubt(weights: np.ndarray, other: np.ndarray) -> np.ndarray:
 @torch.no_grad()
 def two_opinions(model: SkinningModel, head: Head) -> tuple[np.ndarray, np.ndarray]:
     """(V, J) weights of a head, and once more of it mirrored and bent a little."""
+    head, back = working_size(head)
     graph = build_graph(head, model.config.graph)
     device = next(model.parameters()).device
 
     def weights(view):
         mesh, skeleton = mesh_input(view, graph), skeleton_input(view)
-        return model(mesh.to(device), skeleton.to(device)).cpu().numpy()
+        found = model(mesh.to(device), skeleton.to(device)).cpu().numpy()
+        return found if back is None else back @ found
 
     # The mirrored head's left eye is the right one's image, under the left one's name.
     return weights(head), weights(other_view(head))[:, mirror_pairs(head.skeleton)]

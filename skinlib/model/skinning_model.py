@@ -5,14 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.sparse import csr_matrix
 from torch import Tensor, nn
 
+from skinlib.datasets.remesh import coarsen
 from skinlib.graph import GraphConfig
 from skinlib.head import Head
 from skinlib.model.cross_attention import CrossAttention
 from skinlib.model.inputs import MeshInput, SkeletonInput, prepare
 from skinlib.model.mesh_encoder import MeshEncoder
 from skinlib.model.skeleton_encoder import SkeletonEncoder
+from skinlib.painting import prune as pruned
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,17 @@ class ModelConfig:
     heads: int = 4  # attention heads inside the encoders
     convolution: str = "edgeconv"  # graph layer: edgeconv or gat
     graph: GraphConfig = field(default_factory=GraphConfig)  # how the graph is built
+
+
+# More vertices than these are too fine for what the network has learnt.
+FINE, COARSE = 20_000, 8_000
+
+
+def working_size(head: Head) -> tuple[Head, csr_matrix | None]:
+    """The head to compute on, and the way back to its vertices where it is another."""
+    if len(head.vertices) <= FINE or len(head.faces) == 0:
+        return head, None
+    return coarsen(head, COARSE)
 
 
 class SkinningModel(nn.Module):
@@ -78,16 +92,18 @@ class SkinningModel(nn.Module):
     ) -> np.ndarray:
         """(V, J) float32 skin weights of a head.
 
+        A head with more than 20,000 vertices is skinned on a coarse copy, since the
+        network learnt on heads of some thousand: see `coarsen`.
+
         Args:
             prune: weights below this become 0, and the row is normalised again.
             cache: a folder for the graph, see `prepare`.
         """
         device = next(self.parameters()).device
+        head, back = working_size(head)
         mesh, skeleton = prepare(head, self.config.graph, cache)
-        weights = self(mesh.to(device), skeleton.to(device)).cpu()
-        largest = weights.amax(dim=1, keepdim=True)
-        weights = weights.masked_fill(weights < largest.clamp(max=prune), 0)
-        return (weights / weights.sum(dim=1, keepdim=True)).numpy()
+        weights = self(mesh.to(device), skeleton.to(device)).cpu().numpy()
+        return pruned(weights if back is None else back @ weights, prune)
 
     def describe(self) -> dict:
         """The configuration as plain values, for a checkpoint's readable config."""

@@ -74,6 +74,8 @@ class TrainConfig:
     validation_share: float = 0.08  # of the heads, when no validation heads are given
     validations: int = 20  # how often the run is validated
     save_seconds: float = 60.0  # how often the state to resume from is written
+    remeshed: int = 0  # copies of each labelled head that have another mesh
+    remeshed_share: float = 0.5  # of the draws of labelled heads, when there are copies
     unlabelled_share: float = 0.5  # of the draws, when unlabelled heads are given
     unlabelled_start: float = 0.0  # part of the run after which they are drawn
     propagate: bool = True  # unlabelled heads take over rows, see `Propagation`

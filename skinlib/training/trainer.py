@@ -26,6 +26,7 @@ from torch.optim import AdamW, Muon
 from tqdm.auto import tqdm
 
 from skinlib.datasets.augment import augment
+from skinlib.datasets.remesh import another_mesh
 from skinlib.evaluate.groups import group_split
 from skinlib.evaluate.metrics import row_l1
 from skinlib.graph import HybridGraph, build_graph
@@ -106,6 +107,7 @@ class Trainer:
         self.validation = list(validation)
         _check_weights(self.validation, "judge by skinned heads")
         self.graphs: dict[int, HybridGraph] = {}
+        self.copies: dict[tuple[int, int], tuple[Head, HybridGraph]] = {}
         self.carried = self._carry()
 
         torch.manual_seed(config.seed)
@@ -320,8 +322,22 @@ class Trainer:
         epoch, place = divmod(draw, len(self.labelled))
         shuffle = np.random.default_rng([self.config.seed, 2, epoch])
         place = int(shuffle.permutation(len(self.labelled))[place])
-        head, graph = self.labelled[place], self._graph(place, self.labelled[place])
+        copies, share = self.config.remeshed, self.config.remeshed_share
+        if copies and rng.random() < share:
+            head, graph = self._copy(place, int(rng.integers(copies)))
+        else:
+            head = self.labelled[place]
+            graph = self._graph(place, head)
         return head, graph, True, np.ones(len(graph), bool)
+
+    def _copy(self, place: int, number: int) -> tuple[Head, HybridGraph]:
+        """A labelled head on another mesh; each copy is made when it is first drawn."""
+        if (place, number) not in self.copies:
+            rng = np.random.default_rng([self.config.seed, 3, place, number])
+            head = another_mesh(self.labelled[place], rng)
+            graph = build_graph(head, self.model.config.graph)
+            self.copies[place, number] = head, graph
+        return self.copies[place, number]
 
     def _carry(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """(V, J) weights and (V,) known ones of each unlabelled head."""
