@@ -333,7 +333,7 @@ def bench(
         methods=methods,
     )
     results = headbench.run(contest, out)
-    page = write_page(results, targets(results, out, OURS), out / "page")
+    page = write_page(results, targets(results, OURS), out / "page")
     print(markdown(methods_table(results)))
     print(f"{page}: tables and figures")
 

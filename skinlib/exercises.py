@@ -16,6 +16,12 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from skinlib.datasets.synthetic import synthetic_head
+from skinlib.evaluate.metrics import row_l1
+from skinlib.head import Head
+from skinlib.headbench.suites import vary
+from skinlib.skinning import head_bone
+
 Check = Callable[[Any], str | None]
 CHECKS: dict[str, Check] = {}
 
@@ -603,4 +609,161 @@ def _fed(fed: Callable) -> str | None:
         return "twins and physics speak about every head, each critic about one kind"
     if set(fed(True, 0, weights | {"physical": 0.0})) != painted - {"physical"}:
         return "a term of weight 0 is left out"
+    return None
+
+
+# ---- 12 HeadBench
+
+
+@exercise("12.1")
+def _own_method(skin: Callable) -> str | None:
+    """`skin(head)`: (V, J) weights of a head that has none, better than one line."""
+    for seed in (3, 8):
+        head = synthetic_head(seed, vertices=600, bones=12)
+        found = _skinned(skin, head)
+        if found.shape != head.weights.shape:
+            return f"of {head.weights.shape} weights, shape {found.shape} came out"
+        if not np.isfinite(found).all() or found.min() < 0:
+            return "weights are numbers of 0 or more"
+        if not np.allclose(found.sum(axis=1), 1, atol=1e-4):
+            return "each row sums to 1"
+        lazy = np.eye(len(head.skeleton))[head_bone(head.skeleton)]
+        if row_l1(found, head.weights).mean() >= row_l1(lazy, head.weights).mean():
+            return 'not better than "all to the head bone": what do artists give it?'
+        turned = _skinned(skin, vary("rotated", head, seed=0))
+        if row_l1(turned, found).mean() > 0.01:
+            return "in another unit, or with other axes, the rows are the same"
+        listed = vary("reordered", head, seed=0)
+        order = [head.skeleton.names.index(name) for name in listed.skeleton.names]
+        if row_l1(_skinned(skin, listed), found[:, order]).mean() > 0.01:
+            return "listed in another order, each bone keeps its column's weights"
+    return None
+
+
+def _skinned(skin: Callable, head: Head) -> np.ndarray:
+    return np.asarray(skin(head.replace(weights=None)), np.float64)
+
+
+@exercise("12.2")
+def _paired(paired: Callable) -> str | None:
+    """`paired(untouched, varied)`: ratio of the means over common heads."""
+    untouched = {"a": 0.1, "b": 0.3, "c": 0.9}
+    found = paired(dict(untouched), {"a": 0.2, "b": 0.3})
+    if np.shape(found) != ():
+        return f"a ratio is one number, shape {np.shape(found)} came out"
+    if same(found, 0.25 / (1.3 / 3)):
+        return "c is not in the suite: leave it out of the untouched mean as well"
+    if same(found, 1.5):
+        return "divide the means, not each head's errors: a small one would decide"
+    if not same(found, 1.25):
+        return "0.2 and 0.3 against 0.1 and 0.3 is 1.25"
+    if not same(paired({"a": 0.1}, {"a": 0.2, "b": 9.0}), 2):
+        return "a head that was never judged untouched counts on neither side"
+    with np.errstate(all="ignore"):
+        empty = paired({"a": 0.1}, {"b": 0.2})
+    if empty is None or not np.isnan(empty):
+        return "without a common head it is NaN"
+    return None
+
+
+# ---- 13 your own heads
+
+
+@exercise("13.1")
+def _rounds(rounds: Callable) -> str | None:
+    """`rounds(groups)`: (learning ids, judging ids) for each group in turn."""
+    found = [tuple(map(list, pair)) for pair in rounds([2, 0, 2, 1])]
+    if len(found) != 3:
+        return f"there are three base meshes, {len(found)} rounds came out"
+    learning, judging = found[-1]
+    if set(learning) & set(judging):
+        return "no head learns and judges in the same round"
+    if sorted(judging) == [0] or sorted(judging) == [2]:
+        return "sisters judge together: one of them must not learn"
+    if sorted(learning + judging) != [0, 1, 2, 3]:
+        return "in every round each head either learns or judges"
+    if found != [([0, 2, 3], [1]), ([0, 1, 2], [3]), ([1, 3], [0, 2])]:
+        return "group 0 judges first; in a pair come the ids that learn, then the rest"
+    if [tuple(map(list, pair)) for pair in rounds([5, 5])] != [([], [0, 1])]:
+        return "of one base mesh there is one round, and nobody learns in it"
+    return None
+
+
+@exercise("13.2")
+def _heads_needed(heads_needed: Callable) -> str | None:
+    """`heads_needed(counts, errors, target)`: int, from a fitted power law."""
+    counts = np.array([1, 4, 9, 16])
+    found = heads_needed(counts.copy(), 0.4 * counts**-0.5, 0.11)  # at n = 13.2
+    if np.shape(found) != () or found != int(found):
+        return "heads are counted: one whole number"
+    if found == 13:
+        return "13 heads are just not enough: round up"
+    if found != 14:
+        return "0.4 / sqrt(n) falls below 0.11 at n = 13.2: 14 heads"
+    errors = np.exp([1.0, 0.0, -0.5])  # at log n = 0, 1, 2: log e = 0.917 - 0.75 log n
+    if heads_needed(np.exp([0.0, 1.0, 2.0]), errors, np.exp(-0.5)) != 7:
+        return "the line of least squares passes by points that lie on no line"
+    if heads_needed(counts.copy(), 0.4 * counts**-0.5, 3.0) != 1:
+        return "nobody learns from less than one head"
+    return None
+
+
+# ---- 14 into production
+
+
+@exercise("14.1")
+def _first_set(first_set: Callable) -> str | None:
+    """`first_set(row, count)`: ids and weights as a file stores them."""
+    row = np.array([0.125, 0.5, 0.0, 0.25, 0.125])
+    bones, weights = first_set(row.copy(), 2)
+    if np.shape(bones) != (2,) or np.shape(weights) != (2,):
+        return f"two slots, shapes {np.shape(bones)} and {np.shape(weights)} came out"
+    if same(bones, [3, 1]):
+        return "the largest comes first"
+    if not same(bones, [1, 3]):
+        return "of 1/8, 1/2, 0, 1/4, 1/8 the largest two are bones 1 and 3"
+    if not same(weights, [2 / 3, 1 / 3]):
+        return "1/2 and 1/4, scaled to sum 1, are 2/3 and 1/3"
+    bones, weights = first_set(row.copy(), 3)
+    if not same(bones, [1, 3, 0]):
+        return "of two equal weights the lower id stays"
+    bones, weights = first_set(np.array([0.0, 0.0, 1.0]), 2)
+    if not same(weights, [1, 0]):
+        return "a slot that is not needed has weight 0"
+    if not same(bones, [2, 0]):
+        return "a slot without weight names bone 0"
+    bones, weights = first_set(np.array([0.0, 1.0]), 4)
+    if not same(bones, [1, 0, 0, 0]) or not same(weights, [1, 0, 0, 0]):
+        return "four slots, even where the head has fewer bones"
+    return None
+
+
+@exercise("14.2")
+def _to_paint(to_paint: Callable) -> str | None:
+    """`to_paint(confidence, locked, partner, count)`: ids, least confident first."""
+    sure = np.array([0.9, 0.2, 0.5, 0.3, 0.1, 0.2])
+    free, alone = np.zeros(6, bool), np.full(6, -1)
+
+    def listed(locked, partner, count):
+        found = to_paint(sure.copy(), locked.copy(), partner.copy(), count)
+        return [int(vertex) for vertex in found]
+
+    if listed(free, alone, 3) in ([0, 2, 3], [4, 5, 1]):
+        return "the least confident first; of equal ones the lower id"
+    if listed(free, alone, 3) != [4, 1, 5]:
+        return "of confidences .9 .2 .5 .3 .1 .2 the three to paint are 4, 1, 5"
+    last = np.arange(6) == 5
+    if 5 in listed(last, alone, 6):
+        return "what is locked is done"
+    if listed(last, alone, 6) != [4, 1, 3, 2, 0]:
+        return "-1 is nobody: the last vertex, locked, is not everybody's partner"
+    pairs = np.array([1, 0, 2, 4, 3, -1])
+    if 0 in listed(np.arange(6) == 1, pairs, 6):
+        return "a vertex with a locked partner follows it"
+    if 3 in listed(free, pairs, 6):
+        return "of two partners, the less confident one is enough"
+    if listed(free, pairs, 3) != [4, 1, 5]:
+        return "partners use up no place: `count` ids, as long as there are some"
+    if listed(free, pairs, 6) != [4, 1, 5, 2]:
+        return "a vertex in the middle is its own partner, and has to be painted"
     return None

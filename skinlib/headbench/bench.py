@@ -36,7 +36,7 @@ ALL_SUITES = (*SUITES, OTHERS)
 FULLY_JUDGED = ("untouched", OTHERS)
 RESULTS = "results.json"
 NETWORKS = "networks"
-MEMORY = "peak_mb"
+MEMORY, RATIO = "peak_mb", "row_l1_ratio"
 
 # A head and the heads that may be copied from, to (V, J) weights.
 Skin = Callable[[Head, Sequence[Head]], np.ndarray]
@@ -248,6 +248,7 @@ def collect(out: Path) -> dict:
         `{suite: {method: {metric: {"mean": m, "spread": s, "heads": n}}}}`. `mean` is
         over the heads of all folds; `spread` is the standard deviation of the folds'
         means, each fold having its own heads and training seed; 0 for a single fold.
+        `row_l1_ratio` has a mean alone: row-L1 over that of the same heads untouched.
     """
     results: dict = {}
     for suite in ALL_SUITES:
@@ -256,6 +257,7 @@ def collect(out: Path) -> dict:
             cells = [json.loads(file.read_text()) for file in files]
             numbers = _summary(cells)
             if numbers:
+                numbers[RATIO] = {"mean": _ratio(out, suite, method)}
                 results.setdefault(suite, {})[method] = numbers
     return results
 
@@ -287,11 +289,8 @@ def _spread(folds: Sequence[Sequence[float]]) -> dict:
     }
 
 
-def paired(out: Path, suite: str, method: str, metric: str = "row_l1_mean") -> float:
-    """How much larger a method's error is on a suite than on the same heads untouched.
-
-    NaN when it was not judged on both.
-    """
+def _ratio(out: Path, suite: str, method: str) -> float | None:
+    """How much larger row-L1 is on a suite than on the same heads untouched."""
     there, here = [], []
     for file in out.glob(f"cells/*/{suite}/{method}.json"):
         varied = json.loads(file.read_text())["heads"]
@@ -299,9 +298,9 @@ def paired(out: Path, suite: str, method: str, metric: str = "row_l1_mean") -> f
         if file.exists():
             untouched = json.loads(file.read_text())["heads"]
             both = varied.keys() & untouched.keys()
-            there += [varied[name][metric] for name in both]
-            here += [untouched[name][metric] for name in both]
-    return float(np.mean(there) / max(np.mean(here), 1e-12)) if here else float("nan")
+            there += [varied[name]["row_l1_mean"] for name in both]
+            here += [untouched[name]["row_l1_mean"] for name in both]
+    return round(float(np.mean(there) / max(np.mean(here), 1e-12)), 4) if here else None
 
 
 def _cell(out: Path, suite: str, method: str) -> Path:

@@ -17,15 +17,17 @@ OURS = "skinlib, supervised"
 
 @dataclass(frozen=True)
 class Recipe:
-    """A network, and whether it also sees heads without weights."""
+    """A network, and what it sees beside heads with weights."""
 
     network: Callable[[], SkinningModel]
-    unlabelled: bool = False
+    unlabelled: bool = False  # heads without weights
+    remeshed: int = 0  # copies of each head that have another mesh
 
 
 RECIPES = {
     OURS: Recipe(SkinningModel),
     "skinlib, semi-supervised": Recipe(SkinningModel, unlabelled=True),
+    "skinlib, remeshed": Recipe(SkinningModel, remeshed=4),
     "RigNet's skinning": Recipe(RigNetSkinning),
     "point transformer": Recipe(PointTransformer),
 }
@@ -54,7 +56,9 @@ def train_networks(
         if recipe.unlabelled and not unlabelled:
             continue
         # With one thread the processor's time is the run's.
-        config = TrainConfig(minutes=minutes, seed=seed, threads=1)
+        config = TrainConfig(
+            minutes=minutes, seed=seed, threads=1, remeshed=recipe.remeshed
+        )
         bare = ()
         if recipe.unlabelled:
             config, bare = replace(config, unlabelled_share=0.3), unlabelled

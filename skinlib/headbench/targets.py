@@ -1,12 +1,10 @@
 """What HeadBench asks of a method, and what it got."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from skinlib.headbench.bench import OTHERS, TEMPLATE, paired
+from skinlib.headbench.bench import OTHERS, RATIO, TEMPLATE
 from skinlib.headbench.suites import SUITES
 
 UNTOUCHED = "untouched"
@@ -39,12 +37,13 @@ class Target:
         return self.text, f"{sign} {self.bound:g}", measured, verdict
 
 
-def targets(results: dict, out: Path, ours: str) -> list[Target]:
-    """Every target for the method `ours`, of the results of a bench in `out`."""
+def targets(results: dict, ours: str) -> list[Target]:
+    """Every target for the method `ours`; `results` are what `collect` returns."""
 
     def mean(suite: str, method: str, metric: str) -> float:
         numbers = results.get(suite, {}).get(method, {})
-        return numbers.get(metric, {}).get("mean", float("nan"))
+        value = numbers.get(metric, {}).get("mean")
+        return float("nan") if value is None else value
 
     def best(suite: str, methods, metric: str = "row_l1_mean") -> float:
         return float(np.nanmin([mean(suite, m, metric) for m in methods] + [np.inf]))
@@ -69,7 +68,15 @@ def targets(results: dict, out: Path, ours: str) -> list[Target]:
             best(UNTOUCHED, AUTOMATIC) / error,
             at_least=True,
         ),
-        *_ratios(results, out, ours),
+        *(
+            Target(
+                f"{name}: row-L1 over the untouched head's",
+                RATIOS[suite.kind],
+                mean(name, ours, RATIO),
+            )
+            for name, suite in SUITES.items()
+            if suite.kind in RATIOS and name in results
+        ),
         Target(
             f"{OTHERS}: row-L1 over the best template copy's",
             1,
@@ -79,10 +86,3 @@ def targets(results: dict, out: Path, ours: str) -> list[Target]:
         Target("lip bleed", 0.005, mean(UNTOUCHED, ours, "lip_bleed")),
         Target("lid bleed", 0.005, mean(UNTOUCHED, ours, "lid_bleed")),
     ]
-
-
-def _ratios(results: dict, out: Path, ours: str) -> Iterator[Target]:
-    for name, suite in SUITES.items():
-        if suite.kind in RATIOS and name in results:
-            text = f"{name}: row-L1 over the untouched head's"
-            yield Target(text, RATIOS[suite.kind], paired(out, name, ours))

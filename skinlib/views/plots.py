@@ -225,26 +225,37 @@ def method_scatter(
         means = [method["mean"] for method in results["methods"].values()]
         points = np.array([[mean["seconds"], mean[measure]] for mean in means])
         points = np.maximum(points, 1e-4)
-        apart = np.linalg.norm(np.log(points)[:, None] - np.log(points), axis=2)
-        np.fill_diagonal(apart, np.inf)
-        for i, name in enumerate(results["methods"]):
+        for point, name in zip(points, results["methods"], strict=True):
             mine = name == ours
-            axes.scatter(*points[i], s=64 if mine else 36, zorder=2,
+            axes.scatter(*point, s=64 if mine else 36, zorder=2,
                          marker="D" if mine else "o",
                          color=OURS if mine else "#5b6b7b")  # fmt: skip
-            # Of two points close together the upper one has its name above it.
-            above = points[i, 1] >= points[apart[i].argmin(), 1]
-            axes.annotate(name.replace("_", " "), points[i], (6, 5 if above else -12),
-                          textcoords="offset points", size=8.5,
-                          weight="bold" if mine else "normal")  # fmt: skip
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.margins(0.2)
+        axes.set_xlim(right=20 * points[:, 0].max())  # room for the names
         axes.grid(color="#e5e7eb", linewidth=0.7)
         axes.set_axisbelow(True)
         axes.set_xlabel("time a head (s)")
         axes.set_ylabel(label)
         axes.set_title(title, weight="bold")
+        # Names go beside their points, the lowest first, up to where there is room.
+        figure.draw_without_rendering()
+        taken = []
+        for i in np.argsort(points[:, 1]):
+            name = list(results["methods"])[i]
+            weight = "bold" if name == ours else "normal"
+            text = axes.annotate(
+                name.replace("_", " "),
+                points[i],
+                (7, -3),
+                textcoords="offset points",
+                size=8.5,
+                weight=weight,
+            )
+            while any(text.get_window_extent().overlaps(box) for box in taken):
+                text.set_position((7, text.get_position()[1] + 2))
+            taken.append(text.get_window_extent())
         return rasterise(figure, title)
 
 
