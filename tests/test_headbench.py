@@ -1,4 +1,5 @@
 import json
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -77,7 +78,9 @@ def test_results_are_means_over_heads_and_spreads_over_folds(out):
     ratio = halved["row_l1_mean"]["mean"] / number["mean"]
     assert halved["row_l1_ratio"]["mean"] == pytest.approx(ratio, abs=1e-3)
     assert results[OTHERS]["nearest bone"]["row_l1_ratio"]["mean"] is None
-    assert results["untouched"][OURS]["peak_mb"]["heads"] == 1
+    if sys.platform == "linux":
+        memory = {m: results["untouched"][m]["peak_mb"]["mean"] for m in METHODS}
+        assert memory[OURS] > memory["nearest bone"] >= 0
 
 
 def test_what_is_there_is_not_computed_again(contest, out, monkeypatch):

@@ -7,7 +7,6 @@ may share its folder.
 """
 
 import json
-import resource
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -216,26 +215,38 @@ def _scores(method: Skin, heads: Sequence[Head], templates, judged_by) -> dict:
     return found
 
 
-def _peak_memory(name: str, head: Head, part: Fold) -> float:
-    """Megabytes by which a fresh process grows while it skins a head."""
+def _peak_memory(name: str, head: Head, part: Fold) -> float | None:
+    """Megabytes that a fresh process takes to skin a head, beside the packages."""
     context = get_context("spawn")
+    arguments = name, head, list(part.training), part.networks
     with ProcessPoolExecutor(1, context) as pool:
-        return pool.submit(
-            _grown, name, head, list(part.training), part.networks
-        ).result()
+        return pool.submit(_grown, *arguments).result()
 
 
-def _grown(name: str, head: Head, templates: list[Head], networks: Path) -> float:
+def _grown(
+    name: str, head: Head, templates: list[Head], networks: Path
+) -> float | None:
+    skin, head = available(networks)[name], head.replace(weights=None)
     if name not in TEMPLATE | CLASSICAL:
         _network(networks / name)
-    own, children = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    before = resource.getrusage(own).ru_maxrss
     try:
-        available(networks)[name](head.replace(weights=None), templates)
-    except HeadError:
-        return float("nan")
-    grown = resource.getrusage(own).ru_maxrss - before
-    return round(max(grown, resource.getrusage(children).ru_maxrss) / 1024, 1)
+        _RESET_PEAK.write_text("5")
+        before = _peak_kilobytes()
+        skin(head, templates)
+    except (HeadError, OSError):  # a method that cannot, or a system without /proc
+        return None
+    import resource
+
+    children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    return round(max(_peak_kilobytes() - before, children) / 1024, 1)
+
+
+_RESET_PEAK = Path("/proc/self/clear_refs")  # Linux: the peak begins anew at 5
+
+
+def _peak_kilobytes() -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
 
 
 # -- what the cells come to ------------------------------------------------------------
@@ -273,7 +284,7 @@ def _summary(cells: Sequence[Mapping]) -> dict:
     for metric in metrics:
         folds = [[row[metric] for row in rows if metric in row] for rows in heads]
         summary[metric] = _spread([fold for fold in folds if fold])
-    memory = [[cell[MEMORY]] for cell in cells if np.isfinite(cell.get(MEMORY, np.nan))]
+    memory = [[cell[MEMORY]] for cell in cells if cell.get(MEMORY) is not None]
     if memory:
         summary[MEMORY] = _spread(memory)
     return summary
