@@ -41,7 +41,7 @@ lint: $(VENV)/installed
 
 # The accuracy numbers need heads and half an hour: see benchmarks/README.md.
 bench: $(VENV)/installed
-	set -e; for name in edgeconv adversarial_step skin_speed scaling; do \
+	set -e; for name in edgeconv adversarial_step skin_speed speed scaling; do \
 	  echo "== $$name"; $(bin)/python benchmarks/$$name.py; done
 
 clean:

@@ -23,7 +23,7 @@ from skinlib.datasets.folder import load_folder
 from skinlib.evaluate.groups import fold
 from skinlib.evaluate.metrics import row_l1
 from skinlib.headbench.networks import ByProcessorTime
-from skinlib.training import TrainConfig, finetune_config, load_model
+from skinlib.training import TrainConfig, load_model
 
 SIZES = (1, 2, 5, 10, 20, 56)
 
@@ -35,8 +35,8 @@ class Run:
     heads: Positional[Path]  # folder of skinned heads
     out: Positional[Path]  # folder for the runs and results.json
     others: Path  # folder of skinned heads with another rig, to begin with
-    first_minutes: float = 20.0  # on OTHERS
-    minutes: float = 2.0  # on HEADS
+    first_minutes: float = 12.0  # on OTHERS
+    minutes: float = 1.5  # on HEADS
     seeds: tuple[int, ...] = (0, 1)
     sizes: tuple[int, ...] = SIZES  # the last one: as many as the fold has
 
@@ -58,9 +58,7 @@ def main(run: Run) -> None:
         some = [training[i] for i in order[:size]]
         folder = run.out / f"{kind.replace(' ', '-')}_{len(some)}_seed-{seed}"
         config = TrainConfig(minutes=run.minutes, seed=seed, threads=1)
-        model = None
-        if kind == "from the other rig":
-            config, model = finetune_config(config), start
+        model = start if kind == "from the other rig" else None
         if not (folder / "scores.json").exists():
             trained = ByProcessorTime(
                 config, some, folder, validation=[], start=model

@@ -166,6 +166,7 @@ def train(
     unlabelled: OptionalFolder = None,
     validation: OptionalFolder = None,
     start: OptionalCheckpoint = None,
+    remeshed: Annotated[int, arg(metavar="N")] = 0,
     minutes: Annotated[float, arg(metavar="M")] = 30.0,
     seed: Annotated[int, arg(metavar="S")] = 0,
     device: Annotated[str, arg(metavar="D")] = "cpu",
@@ -190,6 +191,8 @@ def train(
             Where their mesh is that of a labelled head, its weights are taken over.
         validation: Folder of skinned heads to judge by; else some meshes of LABELLED.
         start: Begin with this network and adapt it, instead of from nothing.
+        remeshed: Learn from N copies of each head, too, which have other meshes: for
+            heads to come whose meshes are unlike yours. Costs some time.
         minutes: How long to train.
         seed: Same seed, same start.
         device: Where to compute, such as cpu or cuda.
@@ -204,19 +207,22 @@ def train(
         raise HeadError("--threads", f"{threads}", "give 1 or more")
     if not 0 <= seed < 2**32:
         raise HeadError("--seed", f"{seed}", "give 0 to 4294967295")
+    if remeshed < 0:
+        raise HeadError("--remeshed", f"{remeshed}", "give 0 or more")
     config = training.TrainConfig(
-        minutes=minutes, seed=seed, device=_device(device), threads=threads
+        minutes=minutes,
+        remeshed=remeshed,
+        seed=seed,
+        device=_device(device),
+        threads=threads,
     )
-    model = training.load_model(start) if start else None
-    if model:
-        config = training.finetune_config(config)
     training.train(
         config,
         load_folder(labelled),
         out,
         unlabelled=load_folder(unlabelled) if unlabelled else (),
         validation=load_folder(validation) if validation else None,
-        start=model,
+        start=training.load_model(start) if start else None,
     )
     print(f"{out}: use it with `skinlib skin IN OUT --checkpoint {out}`")
 

@@ -70,6 +70,7 @@ def skin(run, *args) -> np.ndarray:
         ("skin", "--lock-vertices ATTRIBUTE _LOCKED --smooth --confidence"),
         ("bench", "--heads --out --unlabelled --others --folds --minutes --suites"),
         ("train", "--labelled --unlabelled --out --minutes --seed --device --start"),
+        ("train", "--remeshed --validation --threads"),
         ("evaluate", "--heads --train-heads --checkpoint --json row-L1"),
         ("lab", "--port --no-browser Ctrl-C"),
         ("demo", "--out"),

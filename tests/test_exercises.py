@@ -5,7 +5,10 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from skinlib.evaluate.baselines import bone_heat
 from skinlib.exercises import CHECKS, check_exercise, exercise, same
+from skinlib.geometry import point_segment_distance
+from skinlib.skinning import head_bone
 
 
 def said(capsys, name, answer) -> str:
@@ -166,6 +169,67 @@ def fed(painted, known, weights):
     return {name for name in terms if weights[name]}
 
 
+def first_set(row, count=4):
+    bones, weights = np.zeros(count, int), np.zeros(count)
+    largest = np.argsort(-row, kind="stable")[:count]
+    largest = largest[row[largest] > 0]
+    bones[: len(largest)] = largest
+    weights[: len(largest)] = row[largest] / row[largest].sum()
+    return bones, weights
+
+
+def to_paint(confidence, locked, partner, count, nobody=True):
+    chosen = []
+    for vertex in np.argsort(confidence, kind="stable").tolist():
+        other = int(partner[vertex])
+        follows = locked[other] and (other >= 0 or not nobody)
+        if not locked[vertex] and not follows and other not in chosen:
+            chosen.append(vertex)
+    return chosen[:count]
+
+
+def near_habit(head):
+    bones = head.skeleton
+    middle = head.vertices - head.vertices.mean(axis=0)
+    size = np.linalg.norm(middle, axis=1).max()
+    distance = point_segment_distance(head.vertices, bones.joints, bones.tails)
+    weights = np.exp(-((distance / size / 0.06) ** 2))
+    weights[:, head_bone(bones)] = 0.3
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def leaning(head, rows, bone, share):
+    """Those rows give a share to one bone."""
+    weights = near_habit(head)
+    weights[rows] *= 1 - share
+    weights[rows, bone] += share
+    return weights
+
+
+def aside(head):
+    return leaning(head, head.vertices[:, 0] > 0, head_bone(head.skeleton), 0.2)
+
+
+def paired(untouched, varied):
+    both = untouched.keys() & varied.keys()
+    if not both:
+        return float("nan")
+    return sum(varied[name] for name in both) / sum(untouched[name] for name in both)
+
+
+def rounds(groups):
+    ids = range(len(groups))
+    return [
+        ([i for i in ids if groups[i] != group], [i for i in ids if groups[i] == group])
+        for group in sorted(set(groups))
+    ]
+
+
+def heads_needed(counts, errors, target):
+    slope, start = np.polyfit(np.log(counts), np.log(errors), 1)
+    return max(1, int(np.ceil(np.exp((np.log(target) - start) / slope))))
+
+
 SOLUTIONS = {
     "00.1": right_bone,
     "00.2": keep_largest,
@@ -191,6 +255,12 @@ SOLUTIONS = {
     "10.2": recent_mean,
     "11.1": kinds,
     "11.2": fed,
+    "12.1": near_habit,
+    "12.2": paired,
+    "13.1": rounds,
+    "13.2": heads_needed,
+    "14.1": first_set,
+    "14.2": to_paint,
 }
 WRONG = [
     ("00.1", lambda p, t: len(t) * right_bone(p, t), "divide"),
@@ -365,6 +435,100 @@ WRONG = [
     ("11.2", lambda p, k, w: fed(p, 1, w), "nothing is supervised"),
     ("11.2", lambda p, k, w: fed(p, k, w) - {"physical"}, "every head"),
     ("11.2", lambda p, k, w: fed(p, k, dict.fromkeys(w, 1)), "weight 0"),
+    ("12.1", lambda head: near_habit(head)[1:], "came out"),
+    ("12.1", lambda head: near_habit(head) * np.nan, "0 or more"),
+    ("12.1", lambda head: near_habit(head) * 2, "sums to 1"),
+    ("12.1", bone_heat, "what do artists"),
+    ("12.1", aside, "other axes"),
+    ("12.1", lambda head: leaning(head, slice(None), 0, 0.03), "another order"),
+    ("12.2", lambda before, after: [1.25], "shape (1,)"),
+    ("12.2", lambda a, b: np.mean([*b.values()]) / np.mean([*a.values()]), "as well"),
+    ("12.2", lambda a, b: np.mean([b[n] / a[n] for n in b if n in a]), "divide"),
+    ("12.2", lambda a, b: paired(b, a), "is 1.25"),
+    ("12.2", lambda a, b: sum(b.values()) / sum(a[n] for n in b if n in a), "neither"),
+    ("12.2", lambda a, b: np.nan_to_num(paired(a, b)), "NaN"),
+    ("13.1", lambda groups: rounds(groups)[:2], "2 rounds"),
+    ("13.1", lambda groups: [(range(4), b) for _, b in rounds(groups)], "the same"),
+    ("13.1", lambda groups: [(a, b[:1]) for a, b in rounds(groups)], "sisters"),
+    ("13.1", lambda groups: [(a[:1], b) for a, b in rounds(groups)], "either"),
+    ("13.1", lambda groups: [(b, a) for a, b in rounds(groups)], "ids that learn"),
+    ("13.1", lambda groups: rounds(groups) if len(groups) > 2 else [], "one round"),
+    ("13.2", lambda counts, errors, target: [14], "whole number"),
+    ("13.2", lambda c, e, t: heads_needed(c, e, t) - 1, "round up"),
+    ("13.2", lambda c, e, t: heads_needed(c, e, t) + 1, "at n = 13.2"),
+    (
+        "13.2",
+        lambda c, e, t: heads_needed(c[[0, -1]], e[[0, -1]], t),
+        "passes by points",
+    ),
+    (
+        "13.2",
+        lambda c, e, t: heads_needed(c, e, t) if t < 2 else 0,
+        "less than one",
+    ),
+    ("14.1", lambda row, count: (row, row), "two slots"),
+    ("14.1", lambda row, count: [x[::-1] for x in first_set(row, count)], "first"),
+    ("14.1", lambda row, count: (np.arange(count), np.ones(count)), "bones 1 and 3"),
+    (
+        "14.1",
+        lambda row, count: (first_set(row, count)[0], -np.sort(-row)[:count]),
+        "2/3 and 1/3",
+    ),
+    (
+        "14.1",
+        lambda row, count: (
+            len(row) - 1 - first_set(row[::-1], count)[0],
+            first_set(row, count)[1],
+        ),
+        "lower id",
+    ),
+    (
+        "14.1",
+        lambda row, count: (first_set(row, count)[0], np.array([2, 1, 1])[:count] / 3),
+        "weight 0",
+    ),
+    (
+        "14.1",
+        lambda row, count: (
+            np.argsort(-row, kind="stable")[:count]
+            + (row.max() == 1) * np.arange(count),
+            first_set(row, count)[1],
+        ),
+        "bone 0",
+    ),
+    (
+        "14.1",
+        lambda row, count: [x[: len(row)] for x in first_set(row, count)],
+        "four slots",
+    ),
+    ("14.2", lambda c, locked, p, n: to_paint(-c, locked, p, n), "least confident"),
+    ("14.2", lambda c, locked, p, n: to_paint(c, locked, p, 2), "4, 1, 5"),
+    ("14.2", lambda c, locked, p, n: to_paint(c, locked & False, p, n), "is done"),
+    ("14.2", lambda *given: to_paint(*given, nobody=False), "-1 is nobody"),
+    (
+        "14.2",
+        lambda c, locked, p, n: to_paint(
+            c, locked, p * 0 - 1 if locked.any() else p, n
+        ),
+        "follows it",
+    ),
+    (
+        "14.2",
+        lambda c, locked, p, n: to_paint(
+            c, locked, p if locked.any() else p * 0 - 1, n
+        ),
+        "enough",
+    ),
+    (
+        "14.2",
+        lambda c, locked, p, n: to_paint(c, locked, p, n)[: n - (p[0] > 0) * (n < 6)],
+        "no place",
+    ),
+    (
+        "14.2",
+        lambda c, locked, p, n: [v for v in to_paint(c, locked, p, n) if p[v] != v],
+        "in the middle",
+    ),
 ]
 
 

@@ -12,7 +12,6 @@ from skinlib.training.config import (
     SUPERVISED_ONLY,
     TermForms,
     TrainConfig,
-    finetune_config,
 )
 from skinlib.training.trainer import HISTORY, Trainer, train
 
@@ -26,7 +25,6 @@ __all__ = [
     "TermForms",
     "TrainConfig",
     "Trainer",
-    "finetune_config",
     "load_model",
     "save_model",
     "train",

@@ -1,7 +1,7 @@
 """The settings of a training run."""
 
 import os
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 
 from skinlib.datasets.augment import AugmentConfig
 from skinlib.losses import LossWeights, TermWeights
@@ -101,8 +101,3 @@ class TrainConfig:
                 "twin changes the mesh or the bones, so that rows and columns of the "
                 "two predictions would not be the same ones: see TWIN"
             )
-
-
-def finetune_config(config: TrainConfig, **changes) -> TrainConfig:
-    """A configuration for going on from a trained model: a tenth of the step size."""
-    return replace(config, learning_rate=config.learning_rate / 10, **changes)
