@@ -155,7 +155,7 @@ def suites_picture(results: Mapping) -> Picture:
         for y, name in enumerate(names):
             if name in results[suite]:
                 table[y, x] = results[suite][name]["row_l1_mean"]["mean"]
-    with new_figure(2.6 + 0.52 * len(suites), 2.2 + 0.3 * len(names)) as figure:
+    with new_figure(2.2 + 0.4 * len(suites), 1.7 + 0.24 * len(names)) as figure:
         axes = figure.subplots()
         norm = LogNorm(max(1e-3, np.nanmin(table)), np.nanmax(table))
         axes.imshow(table, cmap="viridis_r", norm=norm, aspect="auto")
@@ -163,7 +163,7 @@ def suites_picture(results: Mapping) -> Picture:
             if np.isfinite(value):
                 ink = "white" if norm(value) > 0.5 else INK
                 axes.text(x, y, f"{value:.2f}".lstrip("0"), ha="center", va="center",
-                          size=8, color=ink)  # fmt: skip
+                          size=7.5, color=ink)  # fmt: skip
         axes.set_xticks(range(len(suites)), suites, rotation=40, ha="right")
         axes.set_yticks(range(len(names)), names)
         axes.tick_params(length=0)
