@@ -120,6 +120,15 @@ def test_a_run_with_copies_goes_on_to_the_same_bits(heads, tmp_path, monkeypatch
     assert same_tensors(*(tmp_path / n / WEIGHTS for n in ("whole", "stopped")))
 
 
+def test_a_run_without_judges_says_so(heads, tmp_path, capsys):
+    config = replace(CONFIG_OF_TESTS, steps=1)
+    train(config, heads[:1], tmp_path / "none")
+    assert "none is left to judge by" in capsys.readouterr().out
+    train(config, heads[:1], tmp_path / "told", validation=[])
+    train(config, heads[:1], tmp_path / "some", validation=heads[1:])
+    assert "judge" not in capsys.readouterr().out
+
+
 # ---------------------------------------------------------------- it learns
 
 

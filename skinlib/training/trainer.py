@@ -77,7 +77,13 @@ def train(
         KeyboardInterrupt: passed on, after the state has been written.
     """
     with parallel.processes(config) as config:
-        return Trainer(config, labelled, out, unlabelled, validation, start).run()
+        trainer = Trainer(config, labelled, out, unlabelled, validation, start)
+        if validation is None and not trainer.validation and parallel.is_first():
+            tqdm.write(
+                "All heads are learnt from, none is left to judge by: the last network "
+                "is kept. --validation names heads to judge by."
+            )
+        return trainer.run()
 
 
 class Trainer:
