@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from skinlib.geometry import (
+    face_normals,
     islands,
     mesh_edges,
     row_dot,
@@ -22,6 +23,7 @@ from skinlib.geometry import (
 from skinlib.head import Head
 
 MESH, SPACE = 0, 1
+FOLD = -0.8  # least agreement of two flat normals across a cut
 
 
 @dataclass(frozen=True)
@@ -70,8 +72,8 @@ def seam_nodes(head: Head) -> np.ndarray:
     """(V,) int64: vertices that a seam cut apart share a node, 0 .. N-1.
 
     Two vertices are one when they lie at the same position, both on an open border,
-    and their normals agree. Closed lips lie at the same position too, but they are no
-    border, or they face each other.
+    and their normals agree, or just two open edges lie there. Closed lips lie at the
+    same position too, but they are no border, or they face each other.
     """
     position = weld(head.vertices)
     if position.max(initial=-1) + 1 == len(position):
@@ -84,7 +86,7 @@ def seam_nodes(head: Head) -> np.ndarray:
 
     # Chain the vertices of one position in order; join neighbours in the chain.
     order = np.argsort(position, kind="stable")
-    joins = []
+    joins = [_sewn(head, position, border)]
     for reach in (1, 2, 3):
         a, b = order[:-reach], order[reach:]
         same = (position[a] == position[b]) & border[a] & border[b]
@@ -94,6 +96,41 @@ def seam_nodes(head: Head) -> np.ndarray:
     count = len(position)
     links = coo_matrix((np.ones(len(joins)), tuple(joins.T)), shape=(count, count))
     return connected_components(links, directed=False)[1].astype(np.int64)
+
+
+def _sewn(head: Head, position: np.ndarray, border: np.ndarray) -> np.ndarray:
+    """(M, 2) vertices to join where two open edges lie on each other, head to tail.
+
+    Just two, as of a cut, however sharp the crease; four edges may be two lips. Cards
+    painted on both sides fold back onto themselves and stay apart.
+
+    Args:
+        border: (V,) bool, vertices on open edges.
+    """
+    sides = head.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    face = np.repeat(np.arange(len(head.faces)), 3)
+    open_, face = (part[border[sides].all(axis=1)] for part in (sides, face))
+    open_, face = (part[_shared_by(open_, 1)] for part in (open_, face))
+    ends = position[open_]
+    pairs = np.flatnonzero(_shared_by(ends, 2))
+    # The two of a pair come one after the other.
+    one, other = pairs[np.argsort(_keys(ends[pairs]), kind="stable")].reshape(-1, 2).T
+    flat = safe_normalize(face_normals(head.vertices, head.faces))
+    opposed = (ends[one] == ends[other][:, ::-1]).all(axis=1)
+    opposed &= row_dot(flat[face[one]], flat[face[other]]) > FOLD
+    one, other = open_[one[opposed]], open_[other[opposed]]
+    return np.stack([one.ravel(), other[:, ::-1].ravel()], axis=1)
+
+
+def _keys(edges: np.ndarray) -> np.ndarray:
+    """(E,) a number for each edge, whatever its direction."""
+    return edges.min(axis=1) * (edges.max(initial=0) + 1) + edges.max(axis=1)
+
+
+def _shared_by(edges: np.ndarray, count: int) -> np.ndarray:
+    """(E,) bool: edges that are there just so many times, in any direction."""
+    _, place, uses = np.unique(_keys(edges), return_inverse=True, return_counts=True)
+    return uses[place] == count
 
 
 def build_graph(
@@ -126,7 +163,8 @@ def build_graph(
     positions = head.vertices[vertex_of_node].astype(np.float64)
     faces = node_of_vertex[head.faces]
     edges = mesh_edges(faces)
-    normals = node_normals(head.normals, node_of_vertex, count)
+    areas = vertex_areas(head.vertices, head.faces)
+    normals = node_normals(head.normals, node_of_vertex, count, areas)
     island = islands(faces, count)
 
     mesh, length = _mesh_table(positions, edges, config.neighbours)
@@ -136,9 +174,15 @@ def build_graph(
     return HybridGraph(node_of_vertex, vertex_of_node, table, kinds, island, edges)
 
 
-def node_normals(normals, node_of_vertex, count) -> np.ndarray:
-    """(N, 3) float64 unit normals of nodes: the mean over a node's vertices."""
-    summed = [np.bincount(node_of_vertex, axis, count) for axis in normals.T]
+def node_normals(normals, node_of_vertex, count, areas) -> np.ndarray:
+    """(N, 3) float64 unit normals of nodes: the mean over a node's vertices.
+
+    It is weighted by their (V,) areas, so that flat triangles with vertices of their
+    own have the normals of the mesh that they make up.
+    """
+    areas = np.maximum(areas, 1e-12 * areas.max(initial=1e-300))
+    weighted = normals * areas[:, None]
+    summed = [np.bincount(node_of_vertex, axis, count) for axis in weighted.T]
     return safe_normalize(np.stack(summed, axis=1), fallback=(0, 0, 1))
 
 

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from shapes import axis_rotations, bumpy, moved, skeleton, sphere, unwelded
 
 from skinlib import Head
 from skinlib.datasets.synthetic import HeadShape, synthetic_head_and_regions
-from skinlib.geometry import mesh_edges
+from skinlib.geometry import mesh_edges, vertex_areas
 from skinlib.graph import (
     MESH,
     SPACE,
@@ -204,6 +205,43 @@ def test_a_seam_joins_two_halves_and_keeps_their_corners():
     assert build_graph(head).island.tolist() == [0] * 4
 
 
+def fan(*folds: float) -> Head:
+    """A triangle over each side of (0, 0, 0) - (1, 0, 0), turned by so many degrees."""
+    angles = np.radians(folds)
+    tips = np.stack([0 * angles, np.cos(angles), np.sin(angles)], axis=1)
+    corners = [[tip, [1, 0, 0], [0, 0, 0]] for tip in tips]
+    # Every other one the other way round, so that its side runs against the others'.
+    corners = [c[::-1] if i % 2 else c for i, c in enumerate(corners)]
+    faces = np.arange(3 * len(folds)).reshape(-1, 3)
+    return Head.create(np.reshape(corners, (-1, 3)), faces, BONES)
+
+
+@pytest.mark.parametrize(
+    "folds, nodes",
+    [
+        ((0, 180), 4),  # flat
+        ((0, 70), 4),  # a crease sharper than a right angle
+        ((0, 10), 6),  # folded back onto itself, as a card
+        ((0, 70, 0, 70), 6),  # four sides: only those that face one way
+    ],
+)
+def test_a_cut_along_a_crease_is_a_seam(folds, nodes):
+    found = seam_nodes(fan(*folds))
+    assert found.max() + 1 == nodes
+
+
+def test_flat_triangles_of_their_own_have_the_nodes_and_normals_of_the_mesh():
+    whole = sphere(2)
+    soup = unwelded(whole)[0].replace(normals=None)
+    nodes = seam_nodes(soup)
+    assert nodes.max() + 1 == len(whole.vertices)
+    areas = vertex_areas(soup.vertices, soup.faces)
+    normals = node_normals(soup.normals, nodes, len(whole.vertices), areas)
+    first = np.unique(nodes, return_index=True)[1]
+    place = cKDTree(whole.vertices).query(soup.vertices[first])[1]
+    np.testing.assert_allclose(normals, whole.normals[place], atol=1e-5)
+
+
 def test_sides_that_face_each_other_are_no_seam():
     # The same two triangles at one place, back to back: lips, not a seam.
     points = np.tile([[0, 0, 0], [1, 0, 0], [0, 1, 0]], (2, 1))
@@ -321,7 +359,7 @@ def test_node_areas_and_normals_add_up():
     place = nodes[np.unique(old, return_index=True)[1]]
     np.testing.assert_allclose(areas[place], expected, rtol=1e-5)
     assert areas.sum() == pytest.approx(4 * np.pi, rel=0.05)
-    normals = node_normals(apart.normals, nodes, 162)
+    normals = node_normals(apart.normals, nodes, 162, np.ones(len(nodes)))
     np.testing.assert_allclose(normals[place], whole.normals, atol=1e-5)
 
 

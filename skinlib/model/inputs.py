@@ -11,7 +11,13 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from skinlib.geometry import Frame, canonical_frame, curvature, normal_deviation
+from skinlib.geometry import (
+    Frame,
+    canonical_frame,
+    curvature,
+    normal_deviation,
+    vertex_areas,
+)
 from skinlib.graph import MESH, GraphConfig, build_graph, node_areas, node_normals
 from skinlib.head import Head
 
@@ -20,7 +26,7 @@ CURVATURE_UNIT = 10.0
 # In head radii: nothing that belongs to a head is further away. What is (a vertex left
 # behind, a bone in another unit) would overflow once squared.
 FAR = 1e3
-CACHE_VERSION = "3"
+CACHE_VERSION = "4"
 MIN_FRAME_BONES = 5
 
 
@@ -150,7 +156,8 @@ def mesh_input(head: Head, graph, frame: Frame | None = None) -> MeshInput:
     """The mesh half; `graph` may come from an earlier pose of the same mesh."""
     frame = frame or bone_frame(head)
     positions = frame.apply(head.vertices[graph.vertex_of_node])
-    normals = node_normals(head.normals, graph.node_of_vertex, len(graph))
+    areas = vertex_areas(head.vertices, head.faces)
+    normals = node_normals(head.normals, graph.node_of_vertex, len(graph), areas)
     normals = frame.rotate(normals)
     bend = curvature(positions, normals, graph.edges) / CURVATURE_UNIT
     areas = node_areas(head, graph.node_of_vertex, len(graph))
