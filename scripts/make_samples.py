@@ -37,12 +37,17 @@ def make_samples(out: Path = Path(__file__).parents[1] / "data_samples") -> None
         "remeshed.npz": remeshed,
         "unskinned.glb": _y_up(_draw(20022, ADULT)).replace(weights=None),
     }
-    sums = []
     for name, head in heads.items():
         write_head(out / name, head.replace(name=Path(name).stem))
-        digest = hashlib.sha256((out / name).read_bytes()).hexdigest()
-        sums.append(f"{digest}  {name}\n")
-    (out / "SHA256SUMS").write_text("".join(sums))
+    write_sums(out)
+
+
+def write_sums(out: Path) -> None:
+    """List all samples in the folder `out`, heads and garments, in its SHA256SUMS."""
+    samples = sorted([*out.glob("*.npz"), *out.glob("*.glb")])
+    sums = [hashlib.sha256(path.read_bytes()).hexdigest() for path in samples]
+    lines = [f"{sum}  {path.name}\n" for sum, path in zip(sums, samples, strict=True)]
+    (out / "SHA256SUMS").write_text("".join(lines))
 
 
 def _draw(seed: int, config: AnnyConfig) -> Head:

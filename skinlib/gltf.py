@@ -41,13 +41,13 @@ OUR_COLOURS = "skinlib colours"
 
 def read(path: Path, weights: bool = True) -> Head:
     """Read a head; see `skinlib.io.read_glb`."""
-    document = _Document(path)
+    document = Document(path)
     return _head_from(document, _Binding(document), weights)
 
 
 def read_attribute(path: Path, name: str) -> np.ndarray:
     """(V,) values of a custom attribute; 0 on the parts of the head that lack it."""
-    document = _Document(path)
+    document = Document(path)
     blocks = _Binding(document).blocks
     parts, there = [], set()
     for block in blocks:
@@ -85,8 +85,8 @@ def check_attribute(name: str, there: Iterable[str], fix: str, path: Path) -> No
 
 # pygltflib leaves out two properties of the specification, which would be lost when a
 # file is re-skinned.
-_Node = make_dataclass(
-    "_Node", [("weights", list[float] | None, None)], bases=(pygltflib.Node,)
+Node = make_dataclass(
+    "Node", [("weights", list[float] | None, None)], bases=(pygltflib.Node,)
 )
 _Sampler = make_dataclass(
     "_Sampler", [("name", str | None, None)], bases=(pygltflib.Sampler,)
@@ -94,7 +94,7 @@ _Sampler = make_dataclass(
 _GLTF = make_dataclass(
     "_GLTF",
     [
-        ("nodes", list[_Node], field(default_factory=list)),
+        ("nodes", list[Node], field(default_factory=list)),
         ("samplers", list[_Sampler], field(default_factory=list)),
     ],
     bases=(pygltflib.GLTF2,),
@@ -119,7 +119,7 @@ SHAPES = {
 COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
 
 
-class _Document:
+class Document:
     """A glTF file in memory: pygltflib's tree, and the arrays in its buffers."""
 
     def __init__(self, path: Path | None = None):
@@ -304,8 +304,17 @@ class _Document:
             and tree.accessors[i].sparse is None
         ]
 
-    def add(self, array: np.ndarray, kind: str, target: int | None = None) -> int:
-        """Append an array to the buffer; returns the id of its accessor."""
+    def add(
+        self,
+        array: np.ndarray,
+        kind: str,
+        target: int | None = None,
+        bounds: bool = False,
+    ) -> int:
+        """Append an array to the buffer; returns the id of its accessor.
+
+        `bounds` states the smallest and largest values, as positions and times need.
+        """
         tree = self.tree
         if self.free:
             accessor_id = self.free.pop()
@@ -323,6 +332,9 @@ class _Document:
             count=len(array),
             type=kind,
         )
+        if bounds:
+            accessor.min = np.atleast_1d(array.min(axis=0)).tolist()
+            accessor.max = np.atleast_1d(array.max(axis=0)).tolist()
         tree.bufferViews[view_id : view_id + 1] = [view]
         tree.accessors[accessor_id : accessor_id + 1] = [accessor]
         blob += array.tobytes()
@@ -353,7 +365,7 @@ def _index(value: int, items: list) -> int:
     return operator.index(value)
 
 
-def _local_matrix(node: _Node) -> np.ndarray:
+def _local_matrix(node: Node) -> np.ndarray:
     if node.matrix is not None:
         return np.array(node.matrix, np.float64).reshape(4, 4).T
     matrix = np.eye(4)
@@ -377,7 +389,7 @@ class _Block:
 class _Binding:
     """Which nodes, primitives and joints of a glTF file make up the head."""
 
-    def __init__(self, document: _Document):
+    def __init__(self, document: Document):
         self.document = document
         tree = document.tree
         self.world, self.parents, self.order = document.world()
@@ -531,7 +543,7 @@ class _Binding:
         return tuple(names)
 
 
-def _head_from(document: _Document, binding: _Binding, weighted: bool) -> Head:
+def _head_from(document: Document, binding: _Binding, weighted: bool) -> Head:
     skeleton = _skeleton_from(document, binding)
     vertices, normals, faces, weights = [], [], [], []
     weighted = weighted and binding.skinned
@@ -647,7 +659,7 @@ def _weights(document, block: _Block, vertex_count: int, bone_count: int) -> np.
     return weights
 
 
-def _skeleton_from(document: _Document, binding: _Binding) -> Skeleton:
+def _skeleton_from(document: Document, binding: _Binding) -> Skeleton:
     """The joints with the tails that our own files keep in the extras."""
     joints = binding.joint_positions().astype(np.float32)
     names, parents = binding.joint_names(), binding.joint_parents()
@@ -685,6 +697,11 @@ def _kept_bone(extras, joint: np.ndarray):
     return (head, length, direction) if fresh and sound else None
 
 
+def encodable(text: str) -> str:
+    """`text` with what UTF-8 cannot hold, lone surrogates, replaced."""
+    return text.encode(errors="replace").decode()
+
+
 def new_file(
     head: Head,
     max_influences: int | None,
@@ -692,8 +709,27 @@ def new_file(
     attributes: Mapping[str, np.ndarray] | None = None,
 ) -> bytes:
     """A .glb file with the head and nothing else; see `skinlib.io.write_head`."""
-    document = _Document()
-    tree, skeleton = document.tree, head.skeleton
+    document = Document()
+    tree = document.tree
+    add_skeleton(document, head.skeleton)
+    primitive = add_primitive(document, head, max_influences)
+    name = encodable(head.name) or "head"
+    tree.meshes = [pygltflib.Mesh(primitives=[primitive], name=name)]
+    skin = None if head.weights is None else 0
+    tree.nodes.append(Node(name=name, mesh=0, skin=skin))
+    tree.scenes = [pygltflib.Scene(nodes=[len(tree.nodes) - 2, len(tree.nodes) - 1])]
+    tree.scene = 0
+    block = _Block({"POSITION": primitive.attributes.POSITION}, [primitive])
+    _add_attributes(document, [block], colours, attributes or {})
+    return document.to_bytes()
+
+
+def add_skeleton(document: Document, skeleton: Skeleton) -> None:
+    """Put J joints into an empty document: nodes 0 to J - 1, and skin 0.
+
+    Node J stands above the roots: a skin must have a common root.
+    """
+    tree = document.tree
     joints = skeleton.joints.astype(np.float64)
     for bone, parent in enumerate(skeleton.parents):
         local = joints[bone] - (joints[parent] if parent >= 0 else 0)
@@ -702,7 +738,7 @@ def new_file(
             "length": skeleton.lengths[bone].item(),
             "direction": skeleton.directions[bone].tolist(),
         }
-        node = _Node(
+        node = Node(
             name=skeleton.names[bone],
             translation=local.tolist(),
             extras={EXTRAS_KEY: shape},
@@ -710,11 +746,8 @@ def new_file(
         tree.nodes.append(node)
     for bone, children in enumerate(skeleton.children()):
         tree.nodes[bone].children = children
-    # One node above the roots: a skin must have a common root.
     roots = np.flatnonzero(skeleton.parents == -1).tolist()
-    tree.nodes.append(_Node(name="skeleton", children=roots))
-    name = head.name.encode(errors="replace").decode() or "head"
-    tree.nodes.append(_Node(name=name, mesh=0))
+    tree.nodes.append(Node(name="skeleton", children=roots))
     inverse_bind = np.tile(np.eye(4, dtype=np.float32), (len(skeleton), 1, 1))
     inverse_bind[:, 3, :3] = -skeleton.joints  # column by column
     tree.skins = [
@@ -724,16 +757,17 @@ def new_file(
             inverseBindMatrices=document.add(inverse_bind, "MAT4"),
         )
     ]
-    tree.scenes = [pygltflib.Scene(nodes=[len(skeleton), len(skeleton) + 1])]
-    tree.scene = 0
 
+
+def add_primitive(
+    document: Document, head: Head, max_influences: int | None
+) -> pygltflib.Primitive:
+    """Put the vertices, faces and, when it has any, weights of a head into the file."""
+    buffer = pygltflib.ARRAY_BUFFER
     sets = {
-        "POSITION": document.add(head.vertices, "VEC3", pygltflib.ARRAY_BUFFER),
-        "NORMAL": document.add(head.normals, "VEC3", pygltflib.ARRAY_BUFFER),
+        "POSITION": document.add(head.vertices, "VEC3", buffer, bounds=True),
+        "NORMAL": document.add(head.normals, "VEC3", buffer),
     }
-    positions = tree.accessors[sets["POSITION"]]
-    positions.min = head.vertices.min(axis=0).tolist()
-    positions.max = head.vertices.max(axis=0).tolist()
     primitive = pygltflib.Primitive(
         attributes=pygltflib.Attributes(**sets), mode=pygltflib.POINTS
     )
@@ -743,14 +777,11 @@ def new_file(
         ids = head.faces.astype(dtype).ravel()
         primitive.mode = pygltflib.TRIANGLES
         primitive.indices = document.add(ids, "SCALAR", pygltflib.ELEMENT_ARRAY_BUFFER)
-    tree.meshes = [pygltflib.Mesh(primitives=[primitive], name=name)]
     if head.weights is not None:
-        tree.nodes[-1].skin = 0
         bones, values = sorted_influences(head.weights, max_influences)
-        influences = _add_influences(document, bones, values, len(skeleton))
+        influences = _add_influences(document, bones, values, len(head.skeleton))
         vars(primitive.attributes).update(influences)
-    _add_attributes(document, [_Block(sets, [primitive])], colours, attributes or {})
-    return document.to_bytes()
+    return primitive
 
 
 def reskinned(
@@ -771,7 +802,7 @@ def reskinned(
         )
     if head.weights is None:
         raise HeadError("weights", "the head has none", "predict or paint them first")
-    document = _Document(source)
+    document = Document(source)
     binding = _Binding(document)
     columns = _matching_bones(_head_from(document, binding, False), head, source)
     _one_buffer(document)
@@ -792,7 +823,7 @@ def reskinned(
 
 
 def _without_old(
-    document: _Document, binding: _Binding, replaced: Iterable[str]
+    document: Document, binding: _Binding, replaced: Iterable[str]
 ) -> set[int]:
     """Take off the head what is no longer true; returns the accessors it had."""
     accessors = set()
@@ -836,7 +867,7 @@ def _matching_bones(theirs: Head, head: Head, source: Path) -> list[int]:
     return [place[name] for name in theirs.skeleton.names]
 
 
-def _one_buffer(document: _Document) -> None:
+def _one_buffer(document: Document) -> None:
     """Lay all bufferViews into one buffer, so that `add` can append to it."""
     tree = document.tree
     if sum(view.byteLength for view in tree.bufferViews) > 8 * MAX_ELEMENTS:
@@ -856,7 +887,7 @@ def _one_buffer(document: _Document) -> None:
     tree.buffers = [pygltflib.Buffer(byteLength=len(blob))]
 
 
-def _bind(document: _Document, binding: _Binding) -> None:
+def _bind(document: Document, binding: _Binding) -> None:
     """Give the mesh a skin that leaves it where it is."""
     tree = document.tree
     inverse_bind = np.linalg.inv(binding.world[binding.joints]) @ binding.mesh_world
@@ -879,7 +910,7 @@ def _bind(document: _Document, binding: _Binding) -> None:
         for scene in tree.scenes:
             others = [node for node in scene.nodes or [] if node not in tops]
             scene.nodes = [*others, len(tree.nodes)]
-        tree.nodes.append(_Node(name="skeleton", children=sorted(tops)))
+        tree.nodes.append(Node(name="skeleton", children=sorted(tops)))
 
 
 def sorted_influences(
@@ -909,7 +940,7 @@ def sorted_influences(
 
 
 def _add_influences(
-    document: _Document, bones: np.ndarray, values: np.ndarray, bone_count: int
+    document: Document, bones: np.ndarray, values: np.ndarray, bone_count: int
 ) -> dict[str, int]:
     """Put influences into the file, four to a set; returns the new attributes."""
     dtype = np.uint8 if bone_count <= 256 else np.uint16
@@ -926,7 +957,7 @@ def _add_influences(
 
 
 def _add_attributes(
-    document: _Document,
+    document: Document,
     blocks: list[_Block],
     colours: np.ndarray | None,
     attributes: Mapping[str, np.ndarray],

@@ -28,6 +28,7 @@ ROOMS = (
     "painting",
     "gltf",
     "io",
+    "animation",
     "datasets",
     "model",
     "losses",

@@ -222,7 +222,7 @@ class Trainer:
                     f"lower learning_rate ({self.config.learning_rate})"
                 )
         means = _means(shown)
-        with _uninterrupted():
+        with uninterrupted():
             self._update()
             for name, value in means.items():
                 before = self.recent.get(name, value)
@@ -591,7 +591,7 @@ def _check_weights(heads: Sequence[Head], fix: str) -> None:
 
 
 @contextlib.contextmanager
-def _uninterrupted() -> Iterator[None]:
+def uninterrupted() -> Iterator[None]:
     """Ctrl-C waits for the end of the block: nobody can go on from half an update."""
     if threading.current_thread() is not threading.main_thread():
         yield

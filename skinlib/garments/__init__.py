@@ -1,0 +1,1 @@
+"""Clothes on a body that skin weights move: PBNS, virtual bones, and what they need."""

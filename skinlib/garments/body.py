@@ -1,0 +1,212 @@
+"""The body that wears the clothes: a mesh, a skeleton, skin weights, and a few shapes.
+
+A body is a `Head` like all others here: whatever has vertices, bones and weights is
+posed by the same linear blend skinning. The one that ships is drawn with Anny
+(https://github.com/naver/anny) from the CC0 MakeHuman assets, in metres, Z up, the face
+towards -Y, the left hand at +X, in an A-pose.
+"""
+
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from skinlib.garments.motion import Motion
+from skinlib.head import Head, HeadError, Skeleton
+from skinlib.io import atomic, read_npz
+from skinlib.paths import sample
+from skinlib.skinning import forward_kinematics
+
+SHAPES = ("gender", "weight", "muscle", "height")
+"""Anny's phenotypes along which the shipped body changes, from -1 to 1."""
+
+ADULT = {"age": 0.67, "proportions": 0.5} | dict.fromkeys(SHAPES, 0.5)
+# Fingers move with the hand and eyes with the head.
+MERGED = ("finger", "metacarpal", "eye")
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A posable body and the directions in which its shape changes.
+
+    Attributes:
+        head: the mean body; V vertices, J bones, and the weights that bind them.
+        shape_names: K names.
+        shape_vertices: (K, V, 3) float32, what 1 of each shape adds to the vertices.
+        shape_joints: (K, J, 3) float32, and to the joints.
+    """
+
+    head: Head
+    shape_names: tuple[str, ...]
+    shape_vertices: np.ndarray
+    shape_joints: np.ndarray
+
+    def coefficients(self, shape: Mapping[str, float]) -> np.ndarray:
+        """(K,) float32: the amounts of named shapes, 0 for those left out.
+
+        Raises:
+            HeadError: an unknown name, or an amount outside -1 to 1.
+        """
+        unknown = sorted(set(shape) - set(self.shape_names))
+        if unknown:
+            raise HeadError(
+                "shape",
+                f"the body has no shape {unknown[0]!r}",
+                f"choose from {', '.join(self.shape_names)}",
+            )
+        for name, amount in shape.items():
+            if not -1 <= amount <= 1:
+                raise HeadError("shape", f"{name} is {amount:g}", "give -1 to 1")
+        return np.array([shape.get(name, 0) for name in self.shape_names], np.float32)
+
+    def shaped(self, shape: Mapping[str, float]) -> Head:
+        """The body at rest with another shape, such as `{"weight": 0.5}`."""
+        amounts = self.coefficients(shape)
+        skeleton = self.head.skeleton
+        joints = skeleton.joints + np.tensordot(amounts, self.shape_joints, 1)
+        return Head.create(
+            self.head.vertices + np.tensordot(amounts, self.shape_vertices, 1),
+            self.head.faces,
+            Skeleton.from_heads_and_tails(
+                joints, None, skeleton.parents, skeleton.names
+            ),
+            weights=self.head.weights,
+            name=self.head.name,
+        )
+
+    def transforms(self, motion: Motion, amounts: np.ndarray) -> np.ndarray:
+        """(T, J, 4, 4) of the bones when the body has another shape in each frame.
+
+        Args:
+            amounts: (T, K) or (K,), of the shapes.
+
+        Raises:
+            HeadError: the bones of the motion are not those of the body.
+        """
+        motion.transforms(self.head.skeleton)
+        matrices = motion.matrices()
+        # A joint that lies elsewhere: [R | p - R p] with p + d is a shift by d - R d.
+        shift = np.tensordot(amounts, self.shape_joints, 1).astype(np.float32)
+        shift = np.broadcast_to(shift, motion.rotations.shape)
+        moved = shift - (matrices @ shift[..., None])[..., 0]
+        moved[:, self.head.skeleton.parents < 0] += motion.translations[:, None]
+        return forward_kinematics(self.head.skeleton, matrices, moved)
+
+
+def read_body(path: str | Path | None = None) -> Body:
+    """Read a body: the shipped one, or a `.npz` head, with or without shapes.
+
+    Beside the fields of a head, the file may hold `shape_names` (K,), `shape_vertices`
+    (K, V, 3) and `shape_joints` (K, J, 3).
+
+    Raises:
+        HeadError: it cannot be read, has no weights, or its shapes do not fit.
+    """
+    path = Path(path) if path else sample("body.npz")
+    head = read_npz(path)
+    if head.weights is None:
+        raise HeadError("weights", "the body has none", "skin it first", path)
+    keys = ("shape_names", "shape_vertices", "shape_joints")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if keys[0] not in file:
+                names, vertices = (), np.zeros((0, len(head.vertices), 3))
+                joints = np.zeros((0, len(head.skeleton), 3))
+            else:
+                names, vertices, joints = (file[key] for key in keys)
+    except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
+        raise HeadError(
+            "shapes", f"they cannot be read ({error})", f"save {', '.join(keys)}", path
+        ) from error
+    for key, array, count in (
+        (keys[1], vertices, len(head.vertices)),
+        (keys[2], joints, len(head.skeleton)),
+    ):
+        if array.shape != (len(names), count, 3) or not np.isfinite(array).all():
+            raise HeadError(
+                key,
+                f"an array of shape {array.shape}, or one that is not finite",
+                f"store {len(names)} x {count} x 3 finite numbers",
+                path,
+            )
+    return Body(
+        head,
+        tuple(map(str, names)),
+        vertices.astype(np.float32),
+        joints.astype(np.float32),
+    )
+
+
+def write_body(path: str | Path, body: Body) -> None:
+    """Write a body to a compressed `.npz` file; shapes to half precision (0.1 mm)."""
+    head, skeleton = body.head, body.head.skeleton
+    with atomic(path) as file:
+        np.savez_compressed(
+            file,
+            vertices=head.vertices,
+            faces=head.faces.astype(np.int32),
+            bone_names=np.array(skeleton.names),
+            bone_parents=skeleton.parents,
+            bone_heads=skeleton.joints,
+            bone_tails=skeleton.tails,
+            weights=head.weights,
+            shape_names=np.array(body.shape_names),
+            shape_vertices=body.shape_vertices.astype(np.float16),
+            shape_joints=body.shape_joints,
+        )
+
+
+def anny_body() -> Body:
+    """Build the shipped body anew: 12,272 vertices, 24,540 triangles, 36 bones.
+
+    The mean adult, without toes, closed; the first call takes minutes, as for
+    `skinlib.datasets.anny.anny_heads`.
+
+    Raises:
+        HeadError: the package `anny` is not installed.
+    """
+    import torch
+
+    try:
+        from anny import Anny
+    except ImportError as error:
+        raise HeadError(
+            "anny body", "the package anny is not installed", "run `pip install anny`"
+        ) from error
+    model = Anny(rig="anny-notoes", topology="notoes", skinning_method="lbs")
+
+    def rest(**changes) -> tuple[np.ndarray, np.ndarray]:
+        with torch.inference_mode():
+            body = model(None, phenotype_kwargs=ADULT | changes)
+        return (
+            body["rest_vertices"][0].numpy().astype(np.float32),
+            body["rest_bone_heads"][0].numpy().astype(np.float32),
+        )
+
+    names = model.bone_labels
+    kept = [b for b, name in enumerate(names) if not name.startswith(MERGED)]
+    place = {bone: i for i, bone in enumerate(kept)}
+    parents = np.array([place.get(model.bone_parents[bone], -1) for bone in kept])
+    for bone, parent in enumerate(model.bone_parents):  # parents come first
+        place.setdefault(bone, place.get(parent))
+    vertices, joints = rest()
+    weights = np.zeros((len(vertices), len(kept)))
+    columns = np.array([place[bone] for bone in range(len(names))])
+    rows = np.arange(len(weights))[:, None]
+    influences = columns[model.vertex_bone_indices.numpy()]
+    np.add.at(weights, (rows, influences), model.vertex_bone_weights.numpy())
+
+    # Half the way from one end of the phenotype to the other: 1 is the end itself.
+    ends = [(rest(**{name: 1.0}), rest(**{name: 0.0})) for name in SHAPES]
+    skeleton = Skeleton.from_heads_and_tails(
+        joints[kept], None, parents, [names[bone] for bone in kept]
+    )
+    faces = model.get_triangular_faces().numpy()
+    return Body(
+        Head.create(vertices, faces, skeleton, weights=weights, name="body"),
+        SHAPES,
+        np.stack([(high[0] - low[0]) / 2 for high, low in ends]),
+        np.stack([(high[1] - low[1])[kept] / 2 for high, low in ends]),
+    )

@@ -1,0 +1,109 @@
+"""How well a garment moves: is it outside the body, as long as it was cut, unfolded.
+
+Share and depth inside are measured with the true distance to the posed body, which
+training never sees: there the nearest vertex has to do. Elongation, bend and collision
+are named as in GAPS (Chen et al., WACV 2024).
+"""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import torch
+
+from skinlib.garments.binding import behind, signed_distance
+from skinlib.garments.energies import face_normals
+from skinlib.garments.motion import Motion
+from skinlib.garments.outfit import Outfit
+from skinlib.skinning import linear_blend_skinning
+
+DEEP = 0.005
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Means over all frames, but for the deepest; lengths in mm, shares in percent."""
+
+    elongation: float  # mean |l - l0| / l0 over edges
+    stretch: float  # mean |l - l0|
+    bend: float  # mean 1 - cos of the angles between neighbouring faces
+    turned: float  # faces that look the other way from where the bones turn them
+    inside: float  # vertices inside the body
+    deep: float  # vertices deeper than 5 mm inside the body
+    deepest: float  # the deepest vertex of all frames
+    through: float = 0.0  # vertices of a garment inside one that lies below it
+
+    def line(self) -> str:
+        """All numbers in one line."""
+        return ", ".join(f"{name} {value:.3f}" for name, value in asdict(self).items())
+
+
+def skinned(outfit: Outfit, motion: Motion) -> np.ndarray:
+    """(T, V, 3) the garments with the weights of the closest points of the body."""
+    weights = outfit.blend_weights(0)
+    transforms = motion.transforms(outfit.body.head.skeleton)
+    return linear_blend_skinning(outfit.vertices, weights, transforms)
+
+
+def measure(
+    outfit: Outfit,
+    motion: Motion,
+    posed: np.ndarray,
+    shape: dict[str, float] | None = None,
+    rest: np.ndarray | None = None,
+) -> Measures:
+    """Judge the posed vertices (T, V, 3) of an outfit.
+
+    Args:
+        rest: (V, 3) the garment as it was cut, when not as the outfit has it.
+    """
+    body, cloth = outfit.body, outfit.cloth
+    amounts = body.coefficients(shape or {})
+    transforms = body.transforms(motion, amounts)
+    head = body.shaped(shape or {})
+    bodies = linear_blend_skinning(head.vertices, head.weights, transforms)
+    rest = outfit.vertices if rest is None else rest
+
+    edges = cloth.edges.numpy()
+    l0 = _lengths(rest[None], edges)
+    off = np.abs(_lengths(posed, edges) - l0)
+    normals = face_normals(torch.from_numpy(posed), cloth.faces).numpy()
+    first, second = cloth.hinges.numpy().T
+    bend = 1 - (normals[:, first] * normals[:, second]).sum(-1)
+    carried = _carried_normals(outfit, transforms)
+    turned = (normals * carried).sum(-1) < 0
+    depths = np.stack(
+        [
+            signed_distance(points, skin, head.faces)
+            for points, skin in zip(posed, bodies, strict=True)
+        ]
+    )
+    through = [
+        behind(frame[outer], frame[inner], faces).mean()
+        for frame in posed
+        for inner, outer, faces in outfit.overlaps
+    ]
+    return Measures(
+        elongation=100 * float((off / l0).mean()),
+        stretch=1000 * float(off.mean()),
+        bend=float(bend.mean()),
+        turned=100 * float(turned.mean()),
+        inside=100 * float((depths < 0).mean()),
+        deep=100 * float((depths < -DEEP).mean()),
+        deepest=max(0.0, -1000 * float(depths.min())),
+        through=100 * float(np.mean(through)) if through else 0.0,
+    )
+
+
+def _lengths(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """(T, E) lengths of the edges of (T, V, 3)."""
+    return np.linalg.norm(points[:, edges[:, 0]] - points[:, edges[:, 1]], axis=-1)
+
+
+def _carried_normals(outfit: Outfit, transforms: np.ndarray) -> np.ndarray:
+    """(T, F, 3) where the bones turn the normals that the faces have at rest."""
+    rest = torch.from_numpy(outfit.vertices[None])
+    normals = face_normals(rest, outfit.cloth.faces)[0].numpy()
+    weights = outfit.blend_weights(0)[outfit.faces].mean(axis=1)  # (F, J)
+    turns = transforms[..., :3, :3].reshape(len(transforms), -1, 9)
+    blended = (weights @ turns).reshape(*(len(transforms), len(weights), 3, 3))
+    return (blended @ normals[..., None])[..., 0]
