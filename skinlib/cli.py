@@ -1,4 +1,4 @@
-"""The command line: `skinlib skin | train | evaluate | bench | lab | demo | check`.
+"""The command line: `skinlib skin | train | evaluate | bench | garment | lab | ...`.
 
 Each command is a function; its signature and docstring are its options and its help.
 Everything slow to import is imported when a command runs, so that `--help` is quick.
@@ -344,6 +344,154 @@ def bench(
     print(f"{page}: tables and figures")
 
 
+def garment_train(
+    meshes: Annotated[Positional[tuple[Path, ...]], arg(metavar="MESH ...")],
+    *,
+    out: Folder,
+    body: Annotated[Path | None, arg(metavar="FILE")] = None,
+    poses: Annotated[Path | None, arg(metavar="FILE")] = None,
+    pin_top: bool = False,
+    pin_above: Annotated[float | None, arg(metavar="Z")] = None,
+    shapes: bool = False,
+    smooth: Annotated[int | None, arg(metavar="N")] = None,
+    steps: Annotated[int, arg(metavar="N")] = 10_000,
+    seed: Annotated[int, arg(metavar="S")] = 0,
+    device: Annotated[str, arg(metavar="D")] = "cpu",
+    threads: Annotated[int, arg(metavar="T")] = min(2, os.cpu_count() or 1),
+) -> None:
+    """Learn how a garment moves with a body, from physics alone: nothing is simulated.
+
+    MESH is a garment at rest on the body: .glb, .gltf, .obj, .ply, .stl or .npz, in
+    metres. Name several from the skin outwards, and they learn to stay apart. Ctrl-C
+    stops; the same command goes on where it stopped.
+
+    For example:
+      skinlib garment train data_samples/t_shirt.npz --out runs/t_shirt
+      skinlib garment train kilt.glb --out runs/kilt --pin-top --smooth 50
+      skinlib garment train shirt.obj coat.obj --out runs/coat --body me.npz
+      skinlib garment play runs/t_shirt --poses walk --out walk.glb
+
+    Args:
+        meshes: The garments.
+        out: Folder that all is written to; made when there is none.
+        body: Skinned body (.npz, see data_samples/README.md); else the shipped one.
+        poses: Motion (.npz) with the poses to learn; else 4,000 drawn at random.
+        pin_top: Hold the garment at its highest opening, as a skirt at the waist.
+        pin_above: Hold it at all vertices higher than Z metres.
+        shapes: Learn the shapes of the body and looser cuts, too.
+        smooth: Rounds of smoothing of the skin weights; 10, or 50 for what is pinned.
+        steps: How long to train: 10,000 steps are ten to fifteen minutes.
+        seed: Same seed, same garment.
+        device: Where to compute, such as cpu or cuda.
+        threads: CPU cores to use.
+    """
+    from skinlib.garments.body import read_body
+    from skinlib.garments.garment import pin_boundary, read_garment
+    from skinlib.garments.motion import read_motion
+    from skinlib.garments.outfit import Outfit
+    from skinlib.garments.training import GarmentConfig
+    from skinlib.garments.training import train as train_garment
+
+    for name, value, least in (
+        ("--steps", steps, 1),
+        ("--threads", threads, 1),
+        ("--seed", seed, 0),
+        ("--smooth", smooth or 0, 0),
+    ):
+        if value < least:
+            raise HeadError(name, f"{value}", f"give {least} or more")
+    garments = [read_garment(mesh) for mesh in meshes]
+    if pin_top or pin_above is not None:
+        garments = [pin_boundary(garment, pin_above) for garment in garments]
+    outfit = Outfit.create(read_body(body), garments)
+    if smooth is None:
+        smooth = 50 if outfit.pinned.any() else 10
+    config = GarmentConfig(
+        steps=steps,
+        smoothing=smooth,
+        shapes=shapes,
+        seed=seed,
+        device=_device(device),
+        threads=threads,
+    )
+    train_garment(config, outfit, out, read_motion(poses) if poses else None)
+    print(
+        f"{out}: play it with `skinlib garment play {out} --poses walk --out OUT.glb`"
+    )
+
+
+def garment_play(
+    folder: Annotated[Positional[Path], arg(metavar="DIR")],
+    *,
+    poses: Annotated[str, arg(metavar="FILE|NAME")] = "walk",
+    out: Annotated[Path, arg(metavar="FILE")],
+    shape: Annotated[dict[str, float], arg(metavar="NAME AMOUNT ...")] = {},  # noqa: B006
+    ease: Annotated[float, arg(metavar="E")] = 0.0,
+) -> None:
+    """Write a trained garment in motion, for Blender, an engine or numpy.
+
+    For example:
+      skinlib garment play runs/t_shirt --poses walk --out walk.glb
+      skinlib garment play runs/t_shirt --poses my_motion.npz --out vertices.npz
+
+    Args:
+        folder: What `skinlib garment train` wrote.
+        poses: Motion file (.npz), or walk, turn, squat or reach.
+        out: A .glb has the body, the bones and the garments, with the blend shapes
+            driven frame by frame; a .npz has the vertices of every frame.
+        shape: Of the body, such as `weight 0.5`, for a garment trained with --shapes.
+        ease: By how much the cloth is cut wider, such as 0.05, for one trained so.
+    """
+    from skinlib.animation import write_vertex_cache
+    from skinlib.garments.motion import MOTIONS, read_motion
+    from skinlib.garments.outfit import load_outfit
+
+    if out.suffix.lower() not in {".glb", ".npz"}:
+        raise HeadError("--out", f"{out.suffix!r}", "name a .glb or a .npz file", out)
+    outfit, network = load_outfit(folder)
+    make = None if Path(poses).is_file() else MOTIONS.get(poses)
+    motion = make(outfit.body.head.skeleton) if make else read_motion(poses)
+    if out.suffix.lower() == ".npz":
+        posed = outfit.pose(network, motion, shape, ease)
+        write_vertex_cache(out, posed, outfit.faces, motion.fps)
+    else:
+        outfit.export(out, network, motion, shape, ease)
+    print(f"{out}: {len(motion)} frames at {motion.fps:g} a second")
+
+
+def garment_evaluate(
+    folder: Annotated[Positional[Path], arg(metavar="DIR")],
+    *,
+    poses: Annotated[Path | None, arg(metavar="FILE")] = None,
+    json_file: Annotated[Path | None, arg(name="json", metavar="FILE")] = None,
+) -> None:
+    """Judge a trained garment beside skinning alone, on poses it has not learnt.
+
+    Args:
+        folder: What `skinlib garment train` wrote.
+        poses: Motion file (.npz); else eight motions that no training draws.
+        json_file: Write the numbers to this file, too.
+    """
+    from dataclasses import asdict
+
+    from skinlib.garments.measures import joined, measure, skinned
+    from skinlib.garments.motion import held_out_motions, read_motion
+    from skinlib.garments.outfit import load_outfit
+
+    outfit, network = load_outfit(folder)
+    skeleton = outfit.body.head.skeleton
+    motion = read_motion(poses) if poses else joined(held_out_motions(skeleton))
+    results = {
+        "skinning alone": measure(outfit, motion, skinned(outfit, motion)),
+        "PBNS": measure(outfit, motion, outfit.pose(network, motion)),
+    }
+    for name, result in results.items():
+        print(f"{name}: {result.line()}")
+    if json_file:
+        numbers = {name: asdict(result) for name, result in results.items()}
+        json_file.write_text(json.dumps(numbers, indent=1) + "\n")
+
+
 def demo(*, out: Folder = Path("demo")) -> None:
     """Skin the sample head, print the scores, write a .glb and a picture.
 
@@ -382,14 +530,27 @@ def check() -> None:
         sys.exit(1)
 
 
+def garment() -> None:
+    """Learn how clothes move with a body, and play them: train, play, evaluate."""
+
+
 COMMANDS = {
     "skin": skin,
     "train": train,
     "evaluate": evaluate,
     "bench": bench,
+    "garment": garment,
     "lab": lab,
     "demo": demo,
     "check": check,
+}
+
+GROUPS = {
+    "garment": {
+        "train": garment_train,
+        "play": garment_play,
+        "evaluate": garment_evaluate,
+    },
 }
 
 
@@ -404,10 +565,15 @@ def main(args: Sequence[str] | None = None) -> None:
     sys.stdout.reconfigure(errors="backslashreplace")
     # `kill` and `timeout` stop a command as Ctrl-C does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    args = list(sys.argv[1:] if args is None else args)
+    commands, prog = COMMANDS, "skinlib"
+    if args and args[0] in GROUPS:
+        prog += f" {args[0]}"
+        commands = GROUPS[args.pop(0)]
     try:
         tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
-            prog="skinlib",
+            commands,
+            prog=prog,
             description="Head in, skinned head out.",
             args=args,
             config=(FlagCreatePairsOff,),

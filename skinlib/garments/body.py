@@ -6,7 +6,6 @@ posed by the same linear blend skinning. The one that ships is drawn with Anny
 towards -Y, the left hand at +X, in an A-pose.
 """
 
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,32 +101,50 @@ def read_body(path: str | Path | None = None) -> Body:
     (K, V, 3) and `shape_joints` (K, J, 3).
 
     Raises:
-        HeadError: it cannot be read, has no weights, or its shapes do not fit.
+        HeadError: it cannot be read, has no weights, its first bone is not the one
+            root, or its shapes do not fit.
     """
     path = Path(path) if path else sample("body.npz")
     head = read_npz(path)
     if head.weights is None:
         raise HeadError("weights", "the body has none", "skin it first", path)
+    roots = np.flatnonzero(head.skeleton.parents < 0)
+    if roots.tolist() != [0]:
+        raise HeadError(
+            "bone_parents",
+            f"the bones without a parent are {roots.tolist()}",
+            "list the root first, and hang all other bones on it",
+            path,
+        )
     keys = ("shape_names", "shape_vertices", "shape_joints")
     try:
         with np.load(path, allow_pickle=False) as file:
             if keys[0] not in file:
-                names, vertices = (), np.zeros((0, len(head.vertices), 3))
+                names = np.array([], str)
+                vertices = np.zeros((0, len(head.vertices), 3))
                 joints = np.zeros((0, len(head.skeleton), 3))
             else:
                 names, vertices, joints = (file[key] for key in keys)
-    except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
+    except Exception as error:  # whatever a damaged archive makes the libraries raise
         raise HeadError(
             "shapes", f"they cannot be read ({error})", f"save {', '.join(keys)}", path
         ) from error
+    if names.ndim != 1 or names.dtype.kind != "U" or len(set(names)) != len(names):
+        raise HeadError(
+            keys[0],
+            f"{names.dtype} values of shape {names.shape}, or one name twice",
+            "store one string per shape, each another",
+            path,
+        )
     for key, array, count in (
         (keys[1], vertices, len(head.vertices)),
         (keys[2], joints, len(head.skeleton)),
     ):
-        if array.shape != (len(names), count, 3) or not np.isfinite(array).all():
+        fits = array.dtype.kind == "f" and array.shape == (len(names), count, 3)
+        if not fits or not np.isfinite(array).all():
             raise HeadError(
                 key,
-                f"an array of shape {array.shape}, or one that is not finite",
+                f"{array.dtype} values of shape {array.shape}, or one is not finite",
                 f"store {len(names)} x {count} x 3 finite numbers",
                 path,
             )
@@ -152,7 +169,7 @@ def write_body(path: str | Path, body: Body) -> None:
             bone_heads=skeleton.joints,
             bone_tails=skeleton.tails,
             weights=head.weights,
-            shape_names=np.array(body.shape_names),
+            shape_names=np.array(body.shape_names, str),
             shape_vertices=body.shape_vertices.astype(np.float16),
             shape_joints=body.shape_joints,
         )

@@ -5,18 +5,21 @@ training never sees: there the nearest vertex has to do. Elongation, bend and co
 are named as in GAPS (Chen et al., WACV 2024).
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
+import igl
 import numpy as np
 import torch
 
+from skinlib import geometry
 from skinlib.garments.binding import behind, signed_distance
 from skinlib.garments.energies import face_normals
 from skinlib.garments.motion import Motion
 from skinlib.garments.outfit import Outfit
 from skinlib.skinning import linear_blend_skinning
 
-DEEP = 0.005
+DEEP, CLOSE = 0.005, 0.02  # metres
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class Measures:
     elongation: float  # mean |l - l0| / l0 over edges
     stretch: float  # mean |l - l0|
     bend: float  # mean 1 - cos of the angles between neighbouring faces
-    turned: float  # faces that look the other way from where the bones turn them
+    turned: float  # faces within 2 cm of the skin with the outside towards it
     inside: float  # vertices inside the body
     deep: float  # vertices deeper than 5 mm inside the body
     deepest: float  # the deepest vertex of all frames
@@ -35,6 +38,15 @@ class Measures:
     def line(self) -> str:
         """All numbers in one line."""
         return ", ".join(f"{name} {value:.3f}" for name, value in asdict(self).items())
+
+
+def joined(motions: Sequence[Motion]) -> Motion:
+    """One motion after the other, to be measured together."""
+    return Motion.create(
+        np.concatenate([motion.rotations for motion in motions]),
+        motions[0].bone_names,
+        np.concatenate([motion.translations for motion in motions]),
+    )
 
 
 def skinned(outfit: Outfit, motion: Motion) -> np.ndarray:
@@ -69,8 +81,11 @@ def measure(
     normals = face_normals(torch.from_numpy(posed), cloth.faces).numpy()
     first, second = cloth.hinges.numpy().T
     bend = 1 - (normals[:, first] * normals[:, second]).sum(-1)
-    carried = _carried_normals(outfit, transforms)
-    turned = (normals * carried).sum(-1) < 0
+    corners = posed[:, outfit.faces].mean(axis=2)
+    turned = [
+        _inside_out(*frame, head.faces)
+        for frame in zip(corners, normals, bodies, strict=True)
+    ]
     depths = np.stack(
         [
             signed_distance(points, skin, head.faces)
@@ -86,7 +101,7 @@ def measure(
         elongation=100 * float((off / l0).mean()),
         stretch=1000 * float(off.mean()),
         bend=float(bend.mean()),
-        turned=100 * float(turned.mean()),
+        turned=100 * float(np.mean(turned)),
         inside=100 * float((depths < 0).mean()),
         deep=100 * float((depths < -DEEP).mean()),
         deepest=max(0.0, -1000 * float(depths.min())),
@@ -99,11 +114,12 @@ def _lengths(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points[:, edges[:, 0]] - points[:, edges[:, 1]], axis=-1)
 
 
-def _carried_normals(outfit: Outfit, transforms: np.ndarray) -> np.ndarray:
-    """(T, F, 3) where the bones turn the normals that the faces have at rest."""
-    rest = torch.from_numpy(outfit.vertices[None])
-    normals = face_normals(rest, outfit.cloth.faces)[0].numpy()
-    weights = outfit.blend_weights(0)[outfit.faces].mean(axis=1)  # (F, J)
-    turns = transforms[..., :3, :3].reshape(len(transforms), -1, 9)
-    blended = (weights @ turns).reshape(*(len(transforms), len(weights), 3, 3))
-    return (blended @ normals[..., None])[..., 0]
+def _inside_out(
+    centres: np.ndarray, normals: np.ndarray, body: np.ndarray, faces: np.ndarray
+) -> float:
+    """Share of the faces that lie close to the skin and show it their outside."""
+    squared, face, _ = igl.point_mesh_squared_distance(
+        centres.astype(np.float64), body.astype(np.float64), faces
+    )
+    away = (normals * geometry.face_normals(body, faces)[face]).sum(-1) < 0
+    return float((away & (squared < CLOSE**2)).mean())

@@ -18,8 +18,9 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
+from tqdm.auto import tqdm
 
-from skinlib.geometry import safe_normalize
+from skinlib.geometry import safe_normalize, vertex_normals
 from skinlib.head import Head, HeadError, Skeleton
 from skinlib.io import atomic
 from skinlib.skinning import descendants, forward_kinematics, linear_blend_skinning
@@ -395,7 +396,9 @@ class _Part(NamedTuple):
         return np.vstack([points, *(points[cut].mean(axis=0) for cut in self.cuts)])
 
 
-def self_intersection(head: Head, transforms: np.ndarray) -> np.ndarray:
+def self_intersection(
+    head: Head, transforms: np.ndarray, gap: float = 0.0
+) -> np.ndarray:
     """(T,) metres: how deep a limb is in the torso, the head or another limb.
 
     The largest distance from a vertex of one of the `PARTS` that is inside another one
@@ -404,6 +407,8 @@ def self_intersection(head: Head, transforms: np.ndarray) -> np.ndarray:
 
     Args:
         head: a body with weights, closed. transforms: (T, J, 4, 4).
+        gap: metres that limbs have to stay apart: the vertices are moved outwards by
+            as much before they are looked at.
 
     Raises:
         HeadError: it has no weights, or lacks a bone of `PARTS`.
@@ -412,13 +417,18 @@ def self_intersection(head: Head, transforms: np.ndarray) -> np.ndarray:
 
     parts = _parts(head)
     depths = np.zeros(len(transforms))
-    for frame, transform in enumerate(transforms):
+    bar = tqdm(transforms, "poses", leave=False, delay=2)
+    for frame, transform in enumerate(bar):
         posed = linear_blend_skinning(head.vertices, head.weights, transform)
         points = [posed[part.ids].astype(np.float64) for part in parts]
+        raised = points
+        if gap:
+            posed = posed + gap * vertex_normals(posed, head.faces)
+            raised = [posed[part.ids].astype(np.float64) for part in parts]
         for i, part in enumerate(parts):
             low, high = points[i].min(axis=0), points[i].max(axis=0)
             others = np.concatenate(
-                [points[j][other.clear] for j, other in enumerate(parts) if j != i]
+                [raised[j][other.clear] for j, other in enumerate(parts) if j != i]
             )
             near = others[((others > low) & (others < high)).all(axis=1)]
             if len(near) == 0:
@@ -478,7 +488,11 @@ ATTEMPTS = 200
 
 
 def random_poses(
-    skeleton: Skeleton, count: int, seed: int, head: Head | None = None
+    skeleton: Skeleton,
+    count: int,
+    seed: int,
+    head: Head | None = None,
+    gap: float = 0.0,
 ) -> Motion:
     """Independent poses within the limits of all joints, left and right on their own.
 
@@ -489,6 +503,8 @@ def random_poses(
         count: 1 or more. seed: 0 or more.
         head: a body: poses that put one of its limbs more than 5 mm into another (see
             `self_intersection`) are drawn again.
+        gap: metres that its limbs have to stay apart, all but 5 mm of it: between an
+            arm and the chest there must be room for two layers of cloth.
 
     Raises:
         HeadError: no count, a negative seed, a skeleton without the bones of `JOINTS`,
@@ -506,7 +522,7 @@ def random_poses(
         if len(pending) == 0:
             break
         drawn = Motion.create(rotations[pending], skeleton.names)
-        depth = self_intersection(head, drawn.transforms(skeleton))
+        depth = self_intersection(head, drawn.transforms(skeleton), gap)
         pending = pending[depth > DEEPEST]
         for pose in pending.tolist():
             rotations[pose] = _drawn(skeleton, seed, pose, attempt)

@@ -2,7 +2,7 @@
 moves them. A folder holds all of it, so that it plays without anything else."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, cycle, pairwise
@@ -13,8 +13,10 @@ import torch
 
 from skinlib.animation import AnimatedMesh, write_animation
 from skinlib.garments.binding import (
+    check_fit,
     closest_point_values,
     closest_point_weights,
+    layers_apart,
     smooth,
 )
 from skinlib.garments.body import Body, read_body, write_body
@@ -51,6 +53,22 @@ class Outfit:
 
     body: Body
     garments: tuple[Garment, ...]
+
+    @classmethod
+    def create(cls, body: Body, garments: Sequence[Garment]) -> "Outfit":
+        """Check that the garments fit the body and each other.
+
+        Raises:
+            HeadError: none, one far from the body or inside it, or layers that already
+                are in each other.
+        """
+        if not garments:
+            raise HeadError("garments", "there are none", "name at least one mesh")
+        for garment in garments:
+            check_fit(garment, body.head)
+        for inner, outer in combinations(garments, 2):
+            layers_apart(inner, outer)
+        return cls(body, tuple(garments))
 
     @cached_property
     def parts(self) -> list[slice]:

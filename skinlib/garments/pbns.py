@@ -4,7 +4,7 @@ Source: Bertiche, Madadi, Escalera 2021, *PBNS: Physically Based Neural Simulati
 Unsupervised Garment Pose Space Deformation*, ACM TOG 40(6).
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -66,9 +66,8 @@ class PBNS(nn.Module):
         self.columns = nn.Parameter(
             torch.zeros(self.config.embedding, 3 * len(template))
         )
-        self.weight_change = nn.Parameter(
-            torch.zeros(weights.shape), requires_grad=self.config.learn_weights
-        )
+        change = torch.zeros(weights.shape) if self.config.learn_weights else None
+        self.weight_change = None if change is None else nn.Parameter(change)
 
     def describe(self) -> dict:
         """The configuration, as plain numbers."""
@@ -77,9 +76,19 @@ class PBNS(nn.Module):
     @property
     def blend_weights(self) -> Tensor:
         """(V, J), rows >= 0 with sum 1."""
-        if not self.config.learn_weights:
+        if self.weight_change is None:
             return self.weights
         return (self.weights.log() + self.weight_change).softmax(-1)
+
+    def baked(self) -> "PBNS":
+        """The same garment, its learnt blend weights fixed: quicker to play."""
+        config = replace(self.config, learn_weights=False)
+        buffers = [getattr(self, name).cpu().numpy() for name in self.BUFFERS]
+        network = PBNS(*buffers, config)
+        values = self.state_dict() | {"weights": self.blend_weights.detach()}
+        values.pop("weight_change", None)
+        network.load_state_dict(values)
+        return network.eval()
 
     def inputs(
         self,

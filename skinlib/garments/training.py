@@ -27,13 +27,14 @@ from skinlib.garments.energies import (
     pin_energy,
     total_energy,
 )
-from skinlib.garments.motion import Motion, random_poses
+from skinlib.garments.motion import Motion, random_poses, read_motion, write_motion
 from skinlib.garments.outfit import Outfit, save_outfit
 from skinlib.garments.pbns import PBNS, PBNSConfig
 from skinlib.head import HeadError
 from skinlib.training.checkpoint import STATE, read_tensors, replace_file, write_tensors
 from skinlib.training.trainer import uninterrupted
 
+POSES = "poses.npz"
 HISTORY = "history.json"
 RECORD = 100  # steps from one entry of the history to the next
 SHAPE_RANGE, EASE_RANGE = 0.6, (-0.05, 0.1)
@@ -45,6 +46,7 @@ class GarmentConfig:
 
     steps: int = 10_000
     poses: int = 4_000  # drawn once, within joint limits, see `random_poses`
+    gap: float = 0.015  # metres between the limbs in them: room for the cloth
     batch: int = 16  # poses a step
     learning_rate: float = 2e-3  # falls to 1 % along a cosine
     weights_rate: float = 10.0  # times that for learnt blend weights
@@ -94,9 +96,7 @@ class Trainer:
         self.config, self.outfit, self.out = config, outfit, Path(out)
         self.body = outfit.body.head
         if poses is None:
-            poses = random_poses(
-                self.body.skeleton, config.poses, config.seed, self.body
-            )
+            poses = self._random_poses()
         device = config.device
         self.network = outfit.network(
             config.network, config.smoothing, config.shapes, config.seed
@@ -105,18 +105,28 @@ class Trainer:
         self.collider = outfit.collider.to(device)
         self.pinned = torch.from_numpy(outfit.pinned).to(device)
         self._draw(poses)
-        quick = [self.network.weight_change]
-        rest = [p for p in self.network.parameters() if p is not quick[0]]
-        self.parameters = [*rest, *quick]
-        self.rates = [config.learning_rate, config.learning_rate * config.weights_rate]
-        self.optimizer = torch.optim.Adam(
-            [{"params": rest}, {"params": quick}], lr=config.learning_rate
-        )
+        self.parameters = list(self.network.parameters())
+        change = self.network.weight_change
+        groups = [{"params": [p for p in self.parameters if p is not change]}]
+        if change is not None:
+            groups.append({"params": [change], "scale": config.weights_rate})
+        self.optimizer = torch.optim.Adam(groups)
         self.steps_done, self.seconds = 0, 0.0
         self.recent: dict[str, float] = {}  # running means of the energies, joules
         self.history: list[dict] = []
         if (self.out / STATE).exists():
             self._resume()
+
+    def _random_poses(self) -> Motion:
+        """Those of the configuration; kept in `out`, as drawing them takes minutes."""
+        path, skeleton = self.out / POSES, self.body.skeleton
+        if path.exists() and (self.out / STATE).exists():
+            return read_motion(path)
+        config = self.config
+        poses = random_poses(skeleton, config.poses, config.seed, self.body, config.gap)
+        self.out.mkdir(parents=True, exist_ok=True)
+        write_motion(path, poses)
+        return poses
 
     def _draw(self, poses: Motion) -> None:
         """All that the steps need of each pose, once."""
@@ -164,8 +174,9 @@ class Trainer:
         finally:
             torch.set_num_threads(threads)
         self.save()
-        save_outfit(self.out, self.outfit, self.network, self._describe())
-        return self.network
+        network = self.network.baked()
+        save_outfit(self.out, self.outfit, network, self._describe())
+        return network
 
     def step(self) -> dict[str, float]:
         """One step over `batch` poses; returns the mean weighted energies in joules."""
@@ -183,7 +194,8 @@ class Trainer:
                 f"learning_rate ({config.learning_rate})"
             )
         fall = 0.5 * (1 + np.cos(np.pi * self.steps_done / config.steps))
-        for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
+        for group in self.optimizer.param_groups:
+            rate = config.learning_rate * group.get("scale", 1.0)
             group["lr"] = rate * (0.01 + 0.99 * fall)
         weights = asdict(config.energies)
         means = {k: weights[k] * v.mean().item() for k, v in terms.items()}

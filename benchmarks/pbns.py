@@ -1,0 +1,137 @@
+"""PBNS against skinning alone: T-shirt, skirt, two layers, and what each part gives.
+
+    python benchmarks/pbns.py runs/pbns
+    python benchmarks/pbns.py runs/pbns --only t_shirt skirt
+
+Every garment is trained from physics alone and judged on 200 random poses that it has
+not learnt, on 200 of which some press one limb against another, and on eight motions. Skinning alone has the weights of the closest points
+of the body. Runs go on where they stopped; results are kept in OUT/results.json.
+"""
+
+import json
+import statistics
+import time
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import torch
+import tyro
+
+from skinlib.garments.body import read_body
+from skinlib.garments.garment import read_garment
+from skinlib.garments.measures import joined, measure, skinned
+from skinlib.garments.motion import held_out_motions, random_poses
+from skinlib.garments.outfit import Outfit, load_outfit
+from skinlib.garments.training import GarmentConfig, train
+from skinlib.paths import sample
+
+TEST_SEED = 1_000_000
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Garments from the skin outwards, and what is different in their training."""
+
+    garments: tuple[str, ...]
+    steps: int = 10_000
+    changes: dict = field(default_factory=dict)
+    energies: dict = field(default_factory=dict)
+    network: dict = field(default_factory=dict)
+
+    def config(self, threads: int) -> GarmentConfig:
+        """The default configuration with the changes."""
+        standard = GarmentConfig()
+        return replace(
+            standard,
+            steps=self.steps,
+            threads=threads,
+            energies=replace(standard.energies, **self.energies),
+            network=replace(standard.network, **self.network),
+            **self.changes,
+        )
+
+
+FIXED = {"learn_weights": False}
+SOURCE = {"hidden": 32, "embedding": 32, "learn_weights": False}
+AS_PUBLISHED = {"bend": 5e-5, "collision": 25.0, "layer": 25.0}
+EXPERIMENTS = {
+    "t_shirt": Experiment(("t_shirt",)),
+    "no_collision": Experiment(("t_shirt",), 4_000, energies={"collision": 0.0}),
+    "fixed_weights": Experiment(("t_shirt",), 4_000, network=FIXED),
+    "all_terms": Experiment(("t_shirt",), 4_000),
+    "as_published": Experiment(
+        ("t_shirt",), 4_000, {"smoothing": 0}, AS_PUBLISHED, SOURCE
+    ),
+    "skirt": Experiment(("skirt",), 6_000, {"smoothing": 50}),
+    "skirt_fixed": Experiment(("skirt",), 6_000, {"smoothing": 50}, network=FIXED),
+    "skirt_nearest": Experiment(("skirt",), 6_000, {"smoothing": 0}, network=FIXED),
+    "trousers": Experiment(("trousers",), 4_000),
+    "layers": Experiment(("t_shirt", "jacket"), 6_000),
+    "no_layer": Experiment(("t_shirt", "jacket"), 6_000, energies={"layer": 0.0}),
+}
+
+
+def main(
+    out: tyro.conf.Positional[Path],
+    *,
+    only: tuple[str, ...] = tuple(EXPERIMENTS),
+    threads: int = 2,
+) -> None:
+    """Train and judge, or go on where it stopped.
+
+    Args:
+        out: Folder for the garments and results.json.
+        only: These experiments.
+        threads: CPU cores to use.
+    """
+    body = read_body()
+    skeleton = body.head.skeleton
+    tests = {
+        "poses": random_poses(skeleton, 200, TEST_SEED, body.head, GarmentConfig().gap),
+        "pressed": random_poses(skeleton, 200, TEST_SEED, body.head),
+        "motions": joined(held_out_motions(skeleton)),
+    }
+    for name in only:
+        experiment = EXPERIMENTS[name]
+        config = experiment.config(threads)
+        garments = [read_garment(sample(f"{part}.npz")) for part in experiment.garments]
+        train(config, Outfit.create(body, garments), out / name)
+        outfit, network = load_outfit(out / name)
+        state = json.loads((out / name / "config.json").read_text())
+        result = {
+            "minutes": state["seconds"] / 60,
+            "frame_ms": frame_ms(outfit, network),
+        }
+        for test, motion in tests.items():
+            result[test] = {
+                "skinning alone": asdict(
+                    measure(outfit, motion, skinned(outfit, motion))
+                ),
+                "PBNS": asdict(measure(outfit, motion, outfit.pose(network, motion))),
+            }
+        path = out / f"{name}.json"
+        path.write_text(json.dumps(result, indent=1) + "\n")
+        print(f"{name}: {result['minutes']:.1f} minutes, {result['frame_ms']:.2f} ms")
+        for test in tests:
+            for method, values in result[test].items():
+                numbers = "  ".join(f"{k} {v:.3f}" for k, v in values.items())
+                print(f"  {test:8s} {method:15s} {numbers}")
+
+
+def frame_ms(outfit, network, frames: int = 300) -> float:
+    """Median milliseconds of one pose at a time: network and skinning, not the bones."""
+    motion = held_out_motions(outfit.body.head.skeleton)[0]
+    inputs = network.inputs(motion.rotations)
+    transforms = torch.from_numpy(motion.transforms(outfit.body.head.skeleton))
+    times = []
+    with torch.inference_mode():
+        for i in range(frames):
+            one = slice(i % len(motion), i % len(motion) + 1)
+            began = time.perf_counter()
+            network(inputs[one], transforms[one])
+            times.append(time.perf_counter() - began)
+    return 1000 * statistics.median(times)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
