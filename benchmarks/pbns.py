@@ -4,8 +4,9 @@
     python benchmarks/pbns.py runs/pbns --only t_shirt skirt
 
 Every garment is trained from physics alone and judged on 200 random poses that it has
-not learnt, on 200 of which some press one limb against another, and on eight motions. Skinning alone has the weights of the closest points
-of the body. Runs go on where they stopped; results are kept in OUT/results.json.
+not learnt, on 200 of which some press one limb against another, and on eight motions.
+Skinning alone has the weights of the closest points of the body. Runs go on where they
+stopped; the numbers of each are in OUT/NAME.json.
 """
 
 import json
@@ -20,11 +21,22 @@ import tyro
 from skinlib.garments.body import read_body
 from skinlib.garments.garment import read_garment
 from skinlib.garments.measures import joined, measure, skinned
-from skinlib.garments.motion import held_out_motions, random_poses
+from skinlib.garments.motion import (
+    held_out_motions,
+    random_poses,
+    read_motion,
+    write_motion,
+)
 from skinlib.garments.outfit import Outfit, load_outfit
 from skinlib.garments.training import GarmentConfig, train
 from skinlib.paths import sample
 
+SHAPES = (
+    {"weight": 0.5},
+    {"weight": -0.5},
+    {"height": 0.4},
+    {"gender": -0.5, "muscle": 0.5},
+)
 TEST_SEED = 1_000_000
 
 
@@ -66,8 +78,9 @@ EXPERIMENTS = {
     "skirt_fixed": Experiment(("skirt",), 6_000, {"smoothing": 50}, network=FIXED),
     "skirt_nearest": Experiment(("skirt",), 6_000, {"smoothing": 0}, network=FIXED),
     "trousers": Experiment(("trousers",), 4_000),
-    "layers": Experiment(("t_shirt", "jacket"), 6_000),
-    "no_layer": Experiment(("t_shirt", "jacket"), 6_000, energies={"layer": 0.0}),
+    "shapes": Experiment(("t_shirt",), 10_000, {"shapes": True}),
+    "layers": Experiment(("t_shirt", "jacket"), 5_000),
+    "no_layer": Experiment(("t_shirt", "jacket"), 5_000, energies={"layer": 0.0}),
 }
 
 
@@ -80,14 +93,20 @@ def main(
     """Train and judge, or go on where it stopped.
 
     Args:
-        out: Folder for the garments and results.json.
+        out: Folder for the garments and their numbers.
         only: These experiments.
         threads: CPU cores to use.
     """
     body = read_body()
     skeleton = body.head.skeleton
+    standard, file = GarmentConfig(), out / "poses.npz"
+    if not file.exists():
+        out.mkdir(parents=True, exist_ok=True)
+        drawn = (standard.poses, standard.seed, body.head, standard.gap)
+        write_motion(file, random_poses(skeleton, *drawn))
+    poses = read_motion(file)
     tests = {
-        "poses": random_poses(skeleton, 200, TEST_SEED, body.head, GarmentConfig().gap),
+        "poses": random_poses(skeleton, 200, TEST_SEED, body.head, standard.gap),
         "pressed": random_poses(skeleton, 200, TEST_SEED, body.head),
         "motions": joined(held_out_motions(skeleton)),
     }
@@ -95,7 +114,7 @@ def main(
         experiment = EXPERIMENTS[name]
         config = experiment.config(threads)
         garments = [read_garment(sample(f"{part}.npz")) for part in experiment.garments]
-        train(config, Outfit.create(body, garments), out / name)
+        train(config, Outfit.create(body, garments), out / name, poses)
         outfit, network = load_outfit(out / name)
         state = json.loads((out / name / "config.json").read_text())
         result = {
@@ -112,14 +131,26 @@ def main(
         path = out / f"{name}.json"
         path.write_text(json.dumps(result, indent=1) + "\n")
         print(f"{name}: {result['minutes']:.1f} minutes, {result['frame_ms']:.2f} ms")
-        for test in tests:
+        for test in result.keys() - {"minutes", "frame_ms"}:
             for method, values in result[test].items():
                 numbers = "  ".join(f"{k} {v:.3f}" for k, v in values.items())
                 print(f"  {test:8s} {method:15s} {numbers}")
 
 
+def judged(outfit, network, motion, shape=None) -> dict:
+    """The measures of skinning alone and of the network."""
+    methods = {
+        "skinning alone": skinned(outfit, motion, shape),
+        "PBNS": outfit.pose(network, motion, shape),
+    }
+    return {
+        method: asdict(measure(outfit, motion, posed, shape))
+        for method, posed in methods.items()
+    }
+
+
 def frame_ms(outfit, network, frames: int = 300) -> float:
-    """Median milliseconds of one pose at a time: network and skinning, not the bones."""
+    """Median milliseconds of one pose: network and skinning, without the bones."""
     motion = held_out_motions(outfit.body.head.skeleton)[0]
     inputs = network.inputs(motion.rotations)
     transforms = torch.from_numpy(motion.transforms(outfit.body.head.skeleton))

@@ -268,10 +268,7 @@ def evaluate(
     from skinlib.io import atomic
     from skinlib.training import load_model
 
-    if json_file and not json_file.parent.is_dir():
-        raise HeadError(
-            "--json", "there is no such folder", "make it first", json_file.parent
-        )
+    _check_json(json_file)
     scores = compare.evaluate(
         load_folder(heads),
         load_folder(train_heads) if train_heads else None,
@@ -281,6 +278,13 @@ def evaluate(
     if json_file:
         with atomic(json_file) as file:
             file.write(f"{json.dumps(scores, indent=1)}\n".encode())
+
+
+def _check_json(path: Path | None) -> None:
+    if path and not path.parent.is_dir():
+        raise HeadError(
+            "--json", "there is no such folder", "make it first", path.parent
+        )
 
 
 def bench(
@@ -400,6 +404,8 @@ def garment_train(
     ):
         if value < least:
             raise HeadError(name, f"{value}", f"give {least} or more")
+    if seed >= 2**32:
+        raise HeadError("--seed", f"{seed}", "give 0 to 4294967295")
     garments = [read_garment(mesh) for mesh in meshes]
     if pin_top or pin_above is not None:
         garments = [pin_boundary(garment, pin_above) for garment in garments]
@@ -448,9 +454,16 @@ def garment_play(
 
     if out.suffix.lower() not in {".glb", ".npz"}:
         raise HeadError("--out", f"{out.suffix!r}", "name a .glb or a .npz file", out)
+    is_file = Path(poses).is_file()
+    if not is_file and poses not in MOTIONS:
+        raise HeadError(
+            "--poses",
+            f"there is no file and no motion {poses!r}",
+            f"name a .npz file, or one of {', '.join(MOTIONS)}",
+        )
     outfit, network = load_outfit(folder)
-    make = None if Path(poses).is_file() else MOTIONS.get(poses)
-    motion = make(outfit.body.head.skeleton) if make else read_motion(poses)
+    skeleton = outfit.body.head.skeleton
+    motion = read_motion(poses) if is_file else MOTIONS[poses](skeleton)
     if out.suffix.lower() == ".npz":
         posed = outfit.pose(network, motion, shape, ease)
         write_vertex_cache(out, posed, outfit.faces, motion.fps)
@@ -477,7 +490,9 @@ def garment_evaluate(
     from skinlib.garments.measures import joined, measure, skinned
     from skinlib.garments.motion import held_out_motions, read_motion
     from skinlib.garments.outfit import load_outfit
+    from skinlib.io import atomic
 
+    _check_json(json_file)
     outfit, network = load_outfit(folder)
     skeleton = outfit.body.head.skeleton
     motion = read_motion(poses) if poses else joined(held_out_motions(skeleton))
@@ -489,7 +504,8 @@ def garment_evaluate(
         print(f"{name}: {result.line()}")
     if json_file:
         numbers = {name: asdict(result) for name, result in results.items()}
-        json_file.write_text(json.dumps(numbers, indent=1) + "\n")
+        with atomic(json_file) as file:
+            file.write(f"{json.dumps(numbers, indent=1)}\n".encode())
 
 
 def demo(*, out: Folder = Path("demo")) -> None:
@@ -566,15 +582,16 @@ def main(args: Sequence[str] | None = None) -> None:
     # `kill` and `timeout` stop a command as Ctrl-C does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     args = list(sys.argv[1:] if args is None else args)
-    commands, prog = COMMANDS, "skinlib"
+    commands, prog, about = COMMANDS, "skinlib", "Head in, skinned head out."
     if args and args[0] in GROUPS:
         prog += f" {args[0]}"
+        about = COMMANDS[args[0]].__doc__
         commands = GROUPS[args.pop(0)]
     try:
         tyro.extras.subcommand_cli_from_dict(
             commands,
             prog=prog,
-            description="Head in, skinned head out.",
+            description=about,
             args=args,
             config=(FlagCreatePairsOff,),
         )

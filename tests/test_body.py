@@ -278,10 +278,10 @@ def test_a_damaged_file_is_one_error_or_does_no_harm(tmp_path, at):
     place = int(at * len(content))
     content[place : place + 64] = bytes(64)
     (tmp_path / "body.npz").write_bytes(content)
-    with pytest.raises(HeadError, match="body.npz: "):
+    with pytest.raises(HeadError, match=r"body\.npz: "):
         read_body(tmp_path / "body.npz")
 
 
 def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(HeadError, match="no.npz"):
+    with pytest.raises(HeadError, match=r"no\.npz"):
         read_body(tmp_path / "no.npz")

@@ -55,6 +55,18 @@ def test_nearest_of_points_that_are_learnt():
     )
 
 
+def test_nearest_of_what_is_not_finite_is_some_vertex():
+    points, body = clouds()
+    points[0, 3], points[1, 4, 1], body[2, 5] = (
+        float("nan"),
+        -float("inf"),
+        float("nan"),
+    )
+    found = nearest(points, body)
+    assert found.min() >= 0 and found.max() < 90
+    assert torch.equal(found[0, :3], nearest(*clouds())[0, :3])
+
+
 def test_take_picks_rows_of_its_own_pose():
     values = torch.arange(12.0).reshape(2, 2, 3)
     taken = take(values, torch.tensor([[1, 1, 0], [0, 1, 0]]))
@@ -89,7 +101,7 @@ def test_normals_have_derivatives_even_where_there_is_no_face():
 
 
 def test_near_is_what_the_reach_says(head):
-    # Above z = 0.5 by one edge of a cell and the radius: one more ring.
+    # The next rings are 50 mm away, the next vertices of the ring 26 mm.
     point = np.array([[0.1, 0, 0.5]], np.float32)
     found = near(head, point, reach=0.051)
     assert sorted(head.vertices[found, 2].round(2).tolist()) == pytest.approx(
@@ -97,8 +109,10 @@ def test_near_is_what_the_reach_says(head):
     )
     distance = np.linalg.norm(head.vertices - point, axis=1)
     assert np.array_equal(found, np.flatnonzero(distance < 0.051))
-    assert len(near(head, sleeve(0.11).vertices)) == len(head.vertices) - 2
-    assert len(near(head, point + 9)) == 0
+    below = near(head, sleeve(0.11).vertices, reach=0.1)
+    rings = np.unique((100 * head.vertices[below, 2]).round().astype(int))
+    assert rings.tolist() == list(range(15, 90, 5))  # the sleeve: 20 to 80 cm
+    assert len(near(head, point + 9)) == len(head.vertices)  # better than nothing
 
 
 def test_a_collider_keeps_the_faces_whose_corners_it_has(head, whole):

@@ -172,10 +172,12 @@ def test_offsets_are_a_mixture_of_the_columns(network):
         return network.offsets(inputs).detach()
 
     assert (offsets(2 * a - b) - (2 * offsets(a) - offsets(b))).abs().max() < 1e-5
+    amounts = network.embed(inputs).detach()
+    used = int(amounts.sum(dim=0).argmax())
     one = torch.zeros_like(a)
-    one[3, 7] = 1  # y of vertex 2, by amount 3 of the embedding
+    one[used, 7] = 1  # y of vertex 2
     moved = offsets(one)
-    assert torch.equal(moved[:, 2, 1], network.embed(inputs)[:, 3])
+    assert torch.equal(moved[:, 2, 1], amounts[:, used])
     assert moved.count_nonzero() == moved[:, 2, 1].count_nonzero() > 0
 
 
@@ -194,12 +196,12 @@ def test_a_garment_is_cut_for_the_shape(outfit, shaped):
     assert shaped.graded(None) is shaped.template
     cut = shaped.graded(torch.tensor([[0.5, -1], [0, 0]]))
     assert torch.equal(cut[1], shaped.template)
-    # The cloth goes with the skin below it: 0.5 makes the post 0.01 wider.
-    around = cut[0, :, :2].norm(dim=1) - shaped.template[:, :2].norm(dim=1)
-    assert around.numpy() == pytest.approx(0.01, abs=2e-4)
-    inner = slice(24, -24)  # the smoothing pulls the hems
-    fall = cut[0, inner, 2] - 0.9 * shaped.template[inner, 2]
-    assert fall.abs().max() < 0.02
+    # It goes with the skin below, 0.01 outwards and a tenth down, but smoother.
+    away, height = shaped.template[:, :2].norm(dim=1), shaped.template[:, 2]
+    around = cut[0, :, :2].norm(dim=1) - away
+    assert 0.006 < around.min() and around.max() < 0.01
+    assert (cut[0, :, 2] - 0.9 * height).abs().max() < 0.015  # the hems
+    assert (cut[0, :, 2] - 0.9 * height).abs().median() < 0.005
     assert torch.equal(shaped.graded(torch.tensor([0.5, -1])), cut[0])
     motion = bends(2)
     posed, _ = shaped(

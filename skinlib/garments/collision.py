@@ -48,8 +48,12 @@ class Collider(nn.Module):
 
 
 def near(head: Head, points: np.ndarray, reach: float = REACH) -> np.ndarray:
-    """(C,) ids of the body's vertices within `reach` metres of the points (V, 3)."""
-    return np.flatnonzero(cKDTree(points).query(head.vertices)[0] < reach)
+    """(C,) ids of the body's vertices within `reach` metres of the points (V, 3).
+
+    All of them when none is: an obstacle cannot be nothing.
+    """
+    distance, _ = cKDTree(points).query(head.vertices)
+    return np.flatnonzero((distance < reach) | (distance.min() >= reach))
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
@@ -70,9 +74,10 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 def nearest(points: Tensor, body: Tensor) -> Tensor:
     """(B, V) ids of the body vertices (B, C, 3) nearest to the points (B, V, 3).
 
-    By k-d tree, one a pose, built anew: 1 ms and 2,000 points take another.
+    By k-d tree, one a pose, built anew: 1 ms and 2,000 points take another. What is
+    not finite gets some id: the energies tell.
     """
-    points, bodies = points.detach().cpu().numpy(), body.detach().cpu().numpy()
+    points, bodies = (np.nan_to_num(x.detach().cpu().numpy()) for x in (points, body))
 
     def search(pair):
         tree = cKDTree(pair[1], balanced_tree=False, compact_nodes=False)

@@ -188,9 +188,9 @@ def pin_energy(offsets: Tensor, pinned: Tensor) -> Tensor:
 class EnergyWeights:
     """The factor of each energy; with these units the sum is in joules.
 
-    For sums over vertices, edges and hinges. What differs from PBNS's own code measured
-    better (benchmarks/README.md): a stiffer hinge, which leaves waves and takes crumples
-    away, and a collision that outweighs the springs next to it.
+    For sums over vertices, edges and hinges. Where they differ from those of PBNS they
+    measured better (benchmarks/README.md): a stiffer hinge keeps waves and smooths out
+    crumples, and a collision has to outweigh the springs next to it.
 
     Attributes:
         edge: N/m; the springs' stiffness is twice that, as there is no half.

@@ -5,7 +5,7 @@ training never sees: there the nearest vertex has to do. Elongation, bend and co
 are named as in GAPS (Chen et al., WACV 2024).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import igl
@@ -17,6 +17,7 @@ from skinlib.garments.binding import behind, signed_distance
 from skinlib.garments.energies import face_normals
 from skinlib.garments.motion import Motion
 from skinlib.garments.outfit import Outfit
+from skinlib.garments.pbns import PBNSConfig
 from skinlib.skinning import linear_blend_skinning
 
 DEEP, CLOSE = 0.005, 0.02  # metres
@@ -49,31 +50,32 @@ def joined(motions: Sequence[Motion]) -> Motion:
     )
 
 
-def skinned(outfit: Outfit, motion: Motion) -> np.ndarray:
+def skinned(
+    outfit: Outfit, motion: Motion, shape: Mapping[str, float] | None = None
+) -> np.ndarray:
     """(T, V, 3) the garments with the weights of the closest points of the body."""
-    weights = outfit.blend_weights(0)
-    transforms = motion.transforms(outfit.body.head.skeleton)
-    return linear_blend_skinning(outfit.vertices, weights, transforms)
+    fixed = PBNSConfig(learn_weights=False)
+    untrained = outfit.network(fixed, smoothing=0, shapes=bool(shape), seed=0)
+    return outfit.pose(untrained, motion, shape)
 
 
 def measure(
     outfit: Outfit,
     motion: Motion,
     posed: np.ndarray,
-    shape: dict[str, float] | None = None,
-    rest: np.ndarray | None = None,
+    shape: Mapping[str, float] | None = None,
 ) -> Measures:
     """Judge the posed vertices (T, V, 3) of an outfit.
 
     Args:
-        rest: (V, 3) the garment as it was cut, when not as the outfit has it.
+        shape: of the body, for which the garments were cut, too.
     """
     body, cloth = outfit.body, outfit.cloth
     amounts = body.coefficients(shape or {})
     transforms = body.transforms(motion, amounts)
     head = body.shaped(shape or {})
     bodies = linear_blend_skinning(head.vertices, head.weights, transforms)
-    rest = outfit.vertices if rest is None else rest
+    rest = outfit.graded(shape or {})
 
     edges = cloth.edges.numpy()
     l0 = _lengths(rest[None], edges)

@@ -133,6 +133,14 @@ class Outfit:
         moved = smooth(moved, self.faces, CARRIED)
         return moved.reshape(len(moved), -1, 3).transpose(1, 0, 2)
 
+    def graded(self, shape: Mapping[str, float]) -> np.ndarray:
+        """(V, 3) the garments at rest, cut for a body of another shape."""
+        if not shape:
+            return self.vertices
+        amounts = self.body.coefficients(shape)
+        moved = self._carried(self.body.shape_vertices)
+        return self.vertices + np.tensordot(amounts, moved, 1)
+
     @cached_property
     def collider(self) -> Collider:
         """The part of the body that the garments can touch."""
@@ -267,7 +275,7 @@ def load_outfit(folder: str | Path) -> tuple[Outfit, PBNS]:
     try:
         stored = json.loads(metadata["config"])
         config = PBNSConfig(**stored["network"])
-        names = [str(name) for name in stored["garments"]]
+        names = list(zip(stored["garments"], stored["names"], strict=True))
         buffers = [tensors[key].numpy() for key in PBNS.BUFFERS]
         network = PBNS(*buffers, config)
         network.load_state_dict(tensors)
@@ -280,7 +288,23 @@ def load_outfit(folder: str | Path) -> tuple[Outfit, PBNS]:
         ) from error
     garments = tuple(
         replace(read_garment(folder / Path(name).name), name=str(label))
-        for name, label in zip(names, stored["names"], strict=True)
+        for name, label in names
     )
     outfit = Outfit(read_body(folder / BODY), garments)
+    if not _belong_together(outfit, network):
+        raise HeadError(
+            "outfit",
+            "body, garments and network do not belong together",
+            "copy all files of one folder that `skinlib garment train` wrote",
+            folder,
+        )
     return outfit, network.eval()
+
+
+def _belong_together(outfit: Outfit, network: PBNS) -> bool:
+    shapes, bones = len(network.shapes), network.weights.shape[1]
+    return (
+        np.array_equal(outfit.vertices, network.template.numpy())
+        and bones == len(outfit.body.head.skeleton)
+        and shapes in (0, len(outfit.body.shape_names))
+    )

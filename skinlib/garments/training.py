@@ -37,6 +37,7 @@ from skinlib.training.trainer import uninterrupted
 POSES = "poses.npz"
 HISTORY = "history.json"
 RECORD = 100  # steps from one entry of the history to the next
+SLID = 0.15  # metres that a garment may hang lower than it was drafted
 SHAPE_RANGE, EASE_RANGE = 0.6, (-0.05, 0.1)
 
 
@@ -206,8 +207,23 @@ class Trainer:
                 before = self.recent.get(name, value)
                 self.recent[name] = 0.98 * before + 0.02 * value
             if self.steps_done % RECORD == 0:
+                self._check_hold(ids)
                 self.history.append({"step": self.steps_done, **self.recent})
         return means
+
+    def _check_hold(self, ids: np.ndarray) -> None:
+        """Stop when a garment slides off: gravity alone would go on for ever."""
+        with torch.no_grad():
+            drop = -self.network.offsets(self.inputs[ids])[..., 2].mean(0)
+        for garment, part in zip(self.outfit.garments, self.outfit.parts, strict=True):
+            if drop[part].mean() > SLID:
+                raise HeadError(
+                    "pinned",
+                    f"{garment.name or 'the garment'} has slid down by "
+                    f"{drop[part].mean():.2f} m after {self.steps_done} steps",
+                    "pin it at the waist (--pin-top, --pin-above), or choose another "
+                    "rest position",
+                )
 
     def energies(self, ids: np.ndarray) -> dict[str, Tensor]:
         """The energies (B,) of the poses with the ids `ids` (B,), not yet weighted."""
@@ -324,12 +340,18 @@ class Trainer:
         """What has to be the same for a run to be the same."""
         machine = ("threads", "device", "save_seconds")
         settings = {k: v for k, v in asdict(self.config).items() if k not in machine}
+        body, outfit = self.outfit.body, self.outfit
         arrays = {
-            "body": self.body.vertices,
-            "garments": self.outfit.vertices,
-            "faces": self.outfit.faces,
-            "pinned": self.outfit.pinned,
-            "poses": self.poses.rotations,
+            "body vertices": self.body.vertices,
+            "body weights": self.body.weights,
+            "body joints": self.body.skeleton.joints,
+            "shape vertices": body.shape_vertices,
+            "shape joints": body.shape_joints,
+            "garments": outfit.vertices,
+            "faces": outfit.faces,
+            "pinned": outfit.pinned,
+            "rotations": self.poses.rotations,
+            "translations": self.poses.translations,
         }
         meshes = {name: crc32(array.tobytes()) for name, array in arrays.items()}
         return json.loads(json.dumps(settings | meshes))
