@@ -767,3 +767,56 @@ def _to_paint(to_paint: Callable) -> str | None:
     if listed(free, pairs, 6) != [4, 1, 5, 2]:
         return "a vertex in the middle is its own partner, and has to be painted"
     return None
+
+
+# ---- 15 PBNS
+
+
+@exercise("15.1")
+def _push(push: Callable) -> str | None:
+    """`push(vertices, points, normals, epsilon, weight)`: (V, 3) newtons."""
+    normals = np.array([[0.0, 0, 1], [0, 0, 1], [0.6, 0, 0.8]])
+    points = np.array([[1.0, 2, 3], [0, 0, 0], [0, 0, 0]])
+    vertices = points + [[0, 0, -0.002], [0, 0, 0.005], [0.01, 0, -0.01]]
+
+    def of(vertices, points, normals):
+        given = vertices.copy(), points.copy(), normals.copy()
+        return np.asarray(push(*given, 0.004, 25.0))
+
+    found = of(vertices, points, normals)
+    if found.shape != (3, 3):
+        return f"a force of 3 numbers for each of 3 vertices, not {found.shape}"
+    if found[1].any():
+        return "5 mm outside is further than epsilon: no force there"
+    if same(found[0], [0, 0, -0.3]):
+        return "the force is minus the gradient: it pushes out"
+    if same(found[0], [0, 0, 0.15]):
+        return "the derivative of a square has a 2 in front"
+    if same(found[0], [0, 0, 0.1]):
+        return "2 mm deep is 6 mm short of epsilon"
+    if not same(found[0], [0, 0, 0.3]):
+        return "6 mm short, 25 N/m: 2 * 25 * 0.006 = 0.3 N along the normal"
+    # (0.01, 0, -0.01) . (0.6, 0, 0.8) is -2 mm, as for the first vertex.
+    if not same(found[2], [0.18, 0, 0.24]):
+        return "depth is measured along the normal, and the push goes along it"
+    return None
+
+
+@exercise("15.2")
+def _for_engine(for_engine: Callable) -> str | None:
+    """`for_engine(amounts, targets)`: amounts within 0..1, and their targets."""
+    amounts = np.array([[0.0, 0, 3], [4, 0, 1.5], [2, 0, 0]])
+    targets = np.arange(18.0).reshape(3, 2, 3) - 4
+    smaller, larger = map(np.asarray, for_engine(amounts.copy(), targets.copy()))
+    if len(larger) == 3 or smaller.shape == (3, 3):
+        return "the middle target is never used: leave it out"
+    if smaller.shape != (3, 2) or larger.shape != (2, 2, 3):
+        return f"(3, 2) amounts of (2, 2, 3) targets, not {smaller.shape} of {larger.shape}"
+    if smaller.max() > 1 + 1e-6:
+        return "an amount above 1 is clamped"
+    moved = [np.tensordot(a, t, 1) for a, t in ((smaller, larger), (amounts, targets))]
+    if not same(*moved):
+        return "the cloth moves otherwise: what the amounts lose, the targets gain"
+    if not same(smaller.max(axis=0), [1, 1]):
+        return "each target is scaled by its own largest amount, which becomes 1"
+    return None

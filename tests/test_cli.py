@@ -5,16 +5,26 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pygltflib
 import pytest
+import trimesh
+from test_body import bends, sleeve, small_body
+from test_outfit import band
 
 from skinlib import check, cli, demo, gltf
 from skinlib.datasets.synthetic import synthetic_heads
+from skinlib.garments import training as garment_training
+from skinlib.garments.body import read_body, write_body
+from skinlib.garments.garment import write_garment
+from skinlib.garments.motion import Motion, write_motion
+from skinlib.garments.outfit import load_outfit
 from skinlib.io import read_head, write_head
 from skinlib.model import ModelConfig, SkinningModel
 from skinlib.painting import limit_influences, prune, smooth_weights, symmetrize
+from skinlib.paths import sample
 from skinlib.training import TrainConfig, load_model, save_model
 
 SMALL = ModelConfig(mesh_width=8, bone_width=8, blocks=1, points=2, tree_layers=1)
@@ -72,13 +82,17 @@ def skin(run, *args) -> np.ndarray:
         ("train", "--labelled --unlabelled --out --minutes --seed --device --start"),
         ("train", "--remeshed --validation --threads"),
         ("evaluate", "--heads --train-heads --checkpoint --json row-L1"),
+        ("garment train", "MESH --out --body --poses --pin-top --pin-above --shapes"),
+        ("garment train", "--smooth --steps --seed --device --threads Ctrl-C metres"),
+        ("garment play", "DIR --poses FILE|NAME --out --shape --ease .glb .npz"),
+        ("garment evaluate", "DIR --poses --json"),
         ("lab", "--port --no-browser Ctrl-C"),
         ("demo", "--out"),
         ("check", "bug report"),
     ],
 )
 def test_help_names_every_option(run, capsys, command, words):
-    assert run(command, "--help") == 0
+    assert run(*command.split(), "--help") == 0
     text = capsys.readouterr().out
     assert [word for word in words.split() if word not in text] == []
 
@@ -304,6 +318,203 @@ def test_evaluate_writes_the_table_and_the_numbers(run, capsys):
         assert scores["heads"].keys() == {"head_0", "head_1", "head_2"}
         for row in [scores["mean"], *scores["heads"].values()]:
             assert expected <= row.keys()
+
+
+# ------------------------------------------------------------------------------ garment
+
+
+@pytest.fixture(scope="module")
+def wardrobe(place):
+    """A small body with two garments and some poses in `place`; and what is wrong."""
+    write_body(place / "post.npz", small_body())
+    write_garment(place / "sleeve.npz", sleeve(0.115))
+    write_garment(place / "band.npz", band())
+    write_garment(place / "far.npz", replace(sleeve(5.0), name="far"))
+    box = trimesh.creation.box()
+    np.savez(place / "box.npz", vertices=box.vertices, faces=box.faces)
+    motion = bends()
+    write_motion(place / "bends.npz", motion)
+    fields = {"bone_names": np.array(motion.bone_names), "fps": 30.0}
+    np.savez(place / "nan.npz", rotations=0 * motion.rotations + np.nan, **fields)
+    fields["bone_names"] = fields["bone_names"][:2]
+    np.savez(place / "few.npz", rotations=motion.rotations[:, :2], **fields)
+    return place
+
+
+TRAIN = "garment train sleeve.npz --body post.npz --poses bends.npz --threads 1"
+
+
+@pytest.fixture(scope="module")
+def worn(wardrobe):
+    """The name of a folder with a garment that was trained for two steps."""
+    before = os.getcwd()
+    os.chdir(wardrobe)
+    try:
+        cli.main([*TRAIN.split(), "--steps", "2", "--out", "worn"])
+    finally:
+        os.chdir(before)
+    return "worn"
+
+
+def test_train_a_garment_and_play_it(run, worn, capsys):
+    command = f"garment play {worn} --poses bends.npz --out"
+    assert run(*command.split(), "played.glb") == 0
+    assert run(*command.split(), "played.npz") == 0
+    assert "played.npz: 12 frames at 30 a second" in capsys.readouterr().out
+    outfit, network = load_outfit(worn)
+    with np.load("played.npz", allow_pickle=False) as file:
+        assert np.array_equal(file["vertices"], outfit.pose(network, bends()))
+        assert np.array_equal(file["faces"], outfit.faces)
+    names = {node.name for node in pygltflib.GLTF2().load("played.glb").nodes}
+    assert {"body", "sleeve", "hips", "spine", "chest"} <= names
+
+
+def test_the_same_command_goes_on_and_another_does_not(run, worn, capsys):
+    again = f"{TRAIN} --steps 2 --out {worn}"
+    assert run(*again.split()) == 0
+    assert run(*again.split(), "--seed", 1) == 2
+    assert "worn: seed: another run" in capsys.readouterr().err
+
+
+def test_options_of_garment_train_reach_the_training(run, wardrobe):
+    command = TRAIN.replace("sleeve.npz", "sleeve.npz band.npz") + " --steps 1"
+    assert run(*command.split(), "--out", "two", "--shapes", "--seed", 3) == 0
+    training = json.loads((wardrobe / "two" / "config.json").read_text())["training"]
+    assert (training["shapes"], training["seed"], training["steps"]) == (True, 3, 1)
+    assert training["smoothing"] == 50  # the band is pinned
+    outfit, network = load_outfit("two")
+    assert [garment.name for garment in outfit.garments] == ["sleeve", "band"]
+    play = "garment play two --poses bends.npz --out two.npz --ease 0.1"
+    assert run(*play.split(), *"--shape wide 0.5 tall -0.25".split()) == 0
+    with np.load("two.npz", allow_pickle=False) as file:
+        expected = outfit.pose(network, bends(), {"wide": 0.5, "tall": -0.25}, 0.1)
+        assert np.array_equal(file["vertices"], expected)
+    for name, options, pinned, smoothing in (
+        ("top", "--pin-top", 24, 50),
+        ("above", "--pin-above 0.72 --smooth 3", 48, 3),
+        ("free", "", 0, 10),
+    ):
+        command = f"{TRAIN} --steps 1 --out {name} {options}"
+        assert run(*command.split()) == 0
+        assert load_outfit(name)[0].pinned.sum() == pinned
+        stored = json.loads((wardrobe / name / "config.json").read_text())
+        assert stored["training"]["smoothing"] == smoothing
+
+
+def test_a_garment_of_the_shipped_body_walks(run, wardrobe):
+    """The shipped body and the shipped shirt, with poses of ours."""
+    skeleton = read_body().head.skeleton
+    still = Motion.create(np.zeros((2, len(skeleton), 3)), skeleton.names)
+    write_motion(wardrobe / "still.npz", still)
+    shirt = sample("t_shirt.npz")
+    command = "--poses still.npz --steps 1 --threads 1 --out shirt"
+    assert run("garment", "train", shirt, *command.split()) == 0
+    assert run("garment", "play", "shirt", "--out", "walk.npz") == 0
+    with np.load("walk.npz", allow_pickle=False) as file:
+        assert file["vertices"].shape[1:] == load_outfit("shirt")[0].vertices.shape
+        hem = file["vertices"][:, file["vertices"][0, :, 2].argmin()]
+        assert np.ptp(hem, axis=0).max() > 0.005  # metres
+
+
+def test_evaluate_a_garment(run, worn, capsys):
+    command = f"garment evaluate {worn} --poses bends.npz --json worn.json"
+    assert run(*command.split()) == 0
+    out = capsys.readouterr().out
+    with open("worn.json") as file:
+        scores = json.load(file)
+    assert list(scores) == ["skinning alone", "PBNS"]
+    for name, numbers in scores.items():
+        shown = ", ".join(f"{key} {value:.3f}" for key, value in numbers.items())
+        assert f"{name}: {shown}" in out.splitlines()
+        assert {"elongation", "inside", "deepest", "turned"} <= numbers.keys()
+
+
+@pytest.mark.parametrize(
+    "command, message",
+    [
+        (f"{TRAIN} --steps 0 --out bad", "--steps: 0. Give 1 or more"),
+        (f"{TRAIN} --seed -1 --out bad", "--seed"),
+        (f"{TRAIN} --seed 99999999999999999999 --out bad", "--seed"),
+        (f"{TRAIN} --smooth -1 --out bad", "--smooth"),
+        (f"{TRAIN} --threads 0 --out bad", "--threads"),
+        (f"{TRAIN} --device quantum --out bad", "quantum"),
+        (f"{TRAIN} --pin-above 9 --out bad", "no vertex is above 9 m"),
+        (f"{TRAIN} --body no.npz --out bad", "no.npz"),
+        (f"{TRAIN} --body sleeve.npz --out bad", "sleeve.npz"),
+        (f"{TRAIN} --poses no.npz --out bad", "no.npz: motion"),
+        (f"{TRAIN} --poses nan.npz --out bad", "nan.npz: rotations: 12 frames hold N"),
+        (f"{TRAIN} --poses few.npz --out bad", "a motion of 2 bones, a skeleton of 3"),
+        (f"{TRAIN.replace('sleeve', 'no')} --out bad", "no.npz: file: there is no"),
+        (f"{TRAIN.replace('sleeve', 'box')} --out bad", "box.npz: faces: 1 of 1 piec"),
+        (f"{TRAIN.replace('sleeve', 'far')} --out bad", "away from the body"),
+        (
+            f"{TRAIN.replace('sleeve.npz', 'band.npz sleeve.npz')} --out bad",
+            "lie inside band",
+        ),
+        ("garment train sleeve.npz --out bad", "vertices"),  # not the body's
+        ("garment play no --out a.glb", "no/model.safetensors: outfit"),
+        ("garment play worn --out a.fbx", "a.fbx: --out: '.fbx'. Name a .glb or"),
+        ("garment play worn --out no/a.glb --poses bends.npz", "no/a.glb"),
+        ("garment play worn --out no/a.npz --poses bends.npz", "no/a.npz"),
+        ("garment play worn --out a.glb --poses wlak", "'wlak'. Name a .npz file, or"),
+        ("garment play worn --out a.glb --poses few.npz", "a motion of 2 bones"),
+        ("garment play worn --out a.glb --poses nan.npz", "nan.npz: rotations"),
+        (
+            "garment play worn --out a.glb --poses bends.npz --shape wide 0.5",
+            "made for one body",
+        ),
+        ("garment play worn --out a.glb", "has no clavicle.L"),  # no walk for a post
+        ("garment evaluate no", "no/model.safetensors: outfit"),
+        ("garment evaluate worn --poses bends.npz --json no/a.json", "no: --json"),
+    ],
+)
+def test_a_bad_garment_is_one_line_and_nothing_is_written(
+    run, wardrobe, worn, capsys, command, message
+):
+    before = sorted(wardrobe.rglob("*"))
+    capsys.readouterr()
+    assert run(*command.split()) == 2
+    stderr = capsys.readouterr().err
+    assert message in stderr
+    assert stderr.splitlines()[-1].startswith("skinlib: ")
+    assert "Traceback" not in stderr
+    assert sorted(wardrobe.rglob("*")) == before
+
+
+def test_an_energy_that_is_not_finite_is_one_line(run, wardrobe, monkeypatch, capsys):
+    monkeypatch.setattr(
+        garment_training, "collision_energy", lambda points, *_: points[:, 0, 0] / 0
+    )
+    assert run(*TRAIN.split(), "--out", "diverged", "--steps", 2) == 2
+    stderr = capsys.readouterr().err.splitlines()[-1]
+    assert stderr.startswith("skinlib: the energy of step 0 is not finite")
+    assert not list((wardrobe / "diverged").iterdir())
+
+
+def test_a_group_says_what_it_is_for(run, capsys):
+    assert run("garment", "--help") == 0
+    text = capsys.readouterr().out
+    assert "Learn how clothes move with a body" in text
+    assert [word for word in ("train", "play", "evaluate") if word not in text] == []
+    assert run("garment") == 2
+    assert run("garment", "knit") == 2
+    assert run("--help") == 0
+    assert "garment" in capsys.readouterr().out
+
+
+def test_scores_of_a_garment_appear_whole_or_not_at_all(run, worn, monkeypatch, capsys):
+    with open("full.json", "w") as file:
+        file.write("kept")
+
+    def full(*names):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    command = f"garment evaluate {worn} --poses bends.npz --json full.json"
+    assert run(*command.split()) == 2
+    assert "No space left" in capsys.readouterr().err
+    with open("full.json") as file:
+        assert file.read() == "kept"
 
 
 # ------------------------------------------------------------------------------- errors

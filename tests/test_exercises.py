@@ -230,6 +230,18 @@ def heads_needed(counts, errors, target):
     return max(1, int(np.ceil(np.exp((np.log(target) - start) / slope))))
 
 
+def push(vertices, points, normals, epsilon, weight, factor=-2):
+    gap = ((vertices - points) * normals).sum(axis=1, keepdims=True) - epsilon
+    return factor * weight * np.minimum(gap, 0) * normals
+
+
+def for_engine(amounts, targets):
+    largest = amounts.max(axis=0)
+    used = largest > 0
+    largest = largest[used]
+    return amounts[:, used] / largest, targets[used] * largest[:, None, None]
+
+
 SOLUTIONS = {
     "00.1": right_bone,
     "00.2": keep_largest,
@@ -261,6 +273,8 @@ SOLUTIONS = {
     "13.2": heads_needed,
     "14.1": first_set,
     "14.2": to_paint,
+    "15.1": push,
+    "15.2": for_engine,
 }
 WRONG = [
     ("00.1", lambda p, t: len(t) * right_bone(p, t), "divide"),
@@ -528,6 +542,34 @@ WRONG = [
         "14.2",
         lambda c, locked, p, n: [v for v in to_paint(c, locked, p, n) if p[v] != v],
         "in the middle",
+    ),
+    ("15.1", lambda *given: push(*given)[0], "3 vertices"),
+    ("15.1", lambda v, p, n, e, w: push(v, p, n, 0.1, w), "further than epsilon"),
+    ("15.1", lambda *given: push(*given, factor=2), "pushes out"),
+    ("15.1", lambda *given: push(*given, factor=-1), "has a 2"),
+    ("15.1", lambda v, p, n, e, w: push(v, p, n, 0, w), "6 mm short of"),
+    ("15.1", lambda v, p, n, e, w: push(v, p, n, e, 1), "0.3 N"),
+    (
+        "15.1",
+        lambda v, p, n, e, w: push(v, p, n * [0, 0, 1], e, w),
+        "along the normal",
+    ),
+    ("15.2", lambda amounts, targets: (amounts, targets), "leave it out"),
+    ("15.2", lambda *given: [x[:1] for x in for_engine(*given)], "(3, 2) amounts"),
+    (
+        "15.2",
+        lambda amounts, targets: (amounts[:, ::2], targets[::2]),
+        "clamped",
+    ),
+    (
+        "15.2",
+        lambda amounts, targets: (for_engine(amounts, targets)[0], targets[::2]),
+        "otherwise",
+    ),
+    (
+        "15.2",
+        lambda amounts, targets: (amounts[:, ::2] / 4, targets[::2] * 4),
+        "its own largest",
     ),
 ]
 

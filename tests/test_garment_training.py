@@ -334,6 +334,24 @@ def test_a_rate_that_is_too_high_is_told(layers, tmp_path):
     assert not (tmp_path / "run" / STATE).exists()
 
 
+@pytest.mark.parametrize(("drop", "falls"), [(0.2, True), (0.1, False)])
+def test_a_garment_that_slides_off_is_told(layers, tmp_path, monkeypatch, drop, falls):
+    monkeypatch.setattr(training, "RECORD", 1)
+    trainer = Trainer(CONFIG, layers, tmp_path / "run", bends())
+    with torch.no_grad():
+        trainer.network.embed[-2].weight.zero_()
+        trainer.network.embed[-2].bias.fill_(1)  # an embedding of six ones
+        columns = trainer.network.columns.unflatten(-1, (-1, 3))
+        columns[:, layers.parts[1], 2] = -drop / 6
+    if falls:
+        with pytest.raises(HeadError, match=r"pinned: band has slid down by 0\.\d+ m"):
+            trainer.run()
+        assert not (tmp_path / "run" / STATE).exists()
+    else:
+        trainer.run()
+        assert trainer.steps_done == CONFIG.steps
+
+
 @pytest.mark.parametrize("raised", [None, KeyboardInterrupt, FloatingPointError])
 def test_the_number_of_threads_is_as_before(outfit, tmp_path, monkeypatch, raised):
     before = torch.get_num_threads()

@@ -70,10 +70,16 @@ def test_a_tenth_larger(outfit):
     assert found.stretch == pytest.approx(100 * edges, rel=1e-4)
     found = measure(outfit, still(1), frames(0.9 * outfit.vertices))
     assert found.elongation == pytest.approx(10, abs=1e-3)  # shorter counts, too
-    # It was cut so.
-    larger = np.float32(1.1) * outfit.vertices
-    found = measure(outfit, still(1), frames(larger), rest=larger)
-    assert found.elongation == found.stretch == 0
+
+
+def test_a_garment_is_judged_as_it_is_cut_for_a_shape(outfit):
+    shape = {"tall": 1}
+    posed = skinned(outfit, still(2), shape)
+    assert np.ptp(posed[0, :, 2]) > 1.02 * np.ptp(outfit.vertices[:, 2])
+    found = measure(outfit, still(2), posed, shape)
+    assert found.elongation == pytest.approx(0, abs=1e-3)
+    assert (found.inside, found.turned) == (0, 0)
+    assert measure(outfit, still(2), posed).elongation > 1
 
 
 @pytest.mark.parametrize(("radius", "turned"), [(0.115, 2), (0.13, 0)])

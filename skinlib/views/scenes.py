@@ -125,12 +125,15 @@ class View:
         zoom: 1 shows the whole head.
         centre: (3,) file coordinates in the middle of the picture; the middle of
             the head's bounding box without it.
+        upright: trust the file, Z up and the face towards -Y, as for a body; without
+            it the head's frame is found from its shape.
     """
 
     azimuth: float = 22.0
     elevation: float = 6.0
     zoom: float = 1.0
     centre: tuple[float, float, float] | None = None
+    upright: bool = False
 
 
 FRONT = View(azimuth=0.0, elevation=0.0)
@@ -162,11 +165,10 @@ class _Camera:
 
 
 def _camera(head: Head, view: View, size: tuple[int, int]) -> _Camera:
-    frame = head_frame(head)
-    right, up, forward = (
-        np.cross(frame.rotation[1], frame.rotation[2]),
-        *(frame.rotation[1:]),
-    )
+    up, forward = np.eye(3)[2], -np.eye(3)[1]
+    if not view.upright:
+        up, forward = head_frame(head).rotation[1:]
+    right = np.cross(up, forward)
     azimuth, elevation = np.radians([view.azimuth, view.elevation])
     towards = np.cos(azimuth) * forward + np.sin(azimuth) * right
     side = np.cos(azimuth) * right - np.sin(azimuth) * forward
