@@ -22,6 +22,7 @@ from skinlib.garments.body import read_body
 from skinlib.garments.garment import read_garment
 from skinlib.garments.measures import joined, measure, skinned
 from skinlib.garments.motion import (
+    Motion,
     held_out_motions,
     random_poses,
     read_motion,
@@ -37,7 +38,7 @@ SHAPES = (
     {"height": 0.4},
     {"gender": -0.5, "muscle": 0.5},
 )
-TEST_SEED = 1_000_000
+TEST_SEED, TEST_GAP = 1_000_000, 0.02  # metres between the limbs: hands off
 
 
 @dataclass(frozen=True)
@@ -65,22 +66,23 @@ class Experiment:
 
 FIXED = {"learn_weights": False}
 SOURCE = {"hidden": 32, "embedding": 32, "learn_weights": False}
-AS_PUBLISHED = {"bend": 5e-5, "collision": 25.0, "layer": 25.0}
+PUBLISHED = {"bend": 5e-5, "collision": 25.0, "layer": 25.0}
+# All but the first were trained before the weight of the collision was raised.
+SOFTER = {"collision": 250.0}
+SHIRT, SKIRT, LAYERS = ("t_shirt",), ("skirt",), ("t_shirt", "jacket")
+HANGING, NEAREST = {"smoothing": 50}, {"smoothing": 0}
 EXPERIMENTS = {
-    "t_shirt": Experiment(("t_shirt",)),
-    "no_collision": Experiment(("t_shirt",), 4_000, energies={"collision": 0.0}),
-    "fixed_weights": Experiment(("t_shirt",), 4_000, network=FIXED),
-    "all_terms": Experiment(("t_shirt",), 4_000),
-    "as_published": Experiment(
-        ("t_shirt",), 4_000, {"smoothing": 0}, AS_PUBLISHED, SOURCE
-    ),
-    "skirt": Experiment(("skirt",), 6_000, {"smoothing": 50}),
-    "skirt_fixed": Experiment(("skirt",), 6_000, {"smoothing": 50}, network=FIXED),
-    "skirt_nearest": Experiment(("skirt",), 6_000, {"smoothing": 0}, network=FIXED),
-    "trousers": Experiment(("trousers",), 4_000),
-    "shapes": Experiment(("t_shirt",), 10_000, {"shapes": True}),
-    "layers": Experiment(("t_shirt", "jacket"), 5_000),
-    "no_layer": Experiment(("t_shirt", "jacket"), 5_000, energies={"layer": 0.0}),
+    "t_shirt": Experiment(SHIRT, 12_000),
+    "all_terms": Experiment(SHIRT, 4_000, energies=SOFTER),
+    "no_collision": Experiment(SHIRT, 4_000, energies={"collision": 0.0}),
+    "fixed_weights": Experiment(SHIRT, 4_000, energies=SOFTER, network=FIXED),
+    "as_published": Experiment(SHIRT, 4_000, NEAREST, PUBLISHED, SOURCE),
+    "skirt": Experiment(SKIRT, 6_000, HANGING, SOFTER),
+    "skirt_fixed": Experiment(SKIRT, 6_000, HANGING, SOFTER, FIXED),
+    "skirt_nearest": Experiment(SKIRT, 6_000, NEAREST, SOFTER, FIXED),
+    "layers": Experiment(LAYERS, 5_000, energies=SOFTER),
+    "no_layer": Experiment(LAYERS, 5_000, energies=SOFTER | {"layer": 0.0}),
+    "shapes": Experiment(SHIRT, 6_000, {"shapes": True}),
 }
 
 
@@ -106,9 +108,9 @@ def main(
         write_motion(file, random_poses(skeleton, *drawn))
     poses = read_motion(file)
     tests = {
-        "poses": random_poses(skeleton, 200, TEST_SEED, body.head, standard.gap),
+        "poses": random_poses(skeleton, 200, TEST_SEED, body.head, TEST_GAP),
         "pressed": random_poses(skeleton, 200, TEST_SEED, body.head),
-        "motions": joined(held_out_motions(skeleton)),
+        "motions": every_third(joined(held_out_motions(skeleton))),
     }
     for name in only:
         experiment = EXPERIMENTS[name]
@@ -135,6 +137,15 @@ def main(
             for method, values in result[test].items():
                 numbers = "  ".join(f"{k} {v:.3f}" for k, v in values.items())
                 print(f"  {test:8s} {method:15s} {numbers}")
+
+
+def every_third(motion: Motion) -> Motion:
+    """Ten frames a second are enough to judge by."""
+    return replace(
+        motion,
+        rotations=motion.rotations[::3],
+        translations=motion.translations[::3],
+    )
 
 
 def judged(outfit, network, motion, shape=None) -> dict:

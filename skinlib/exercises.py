@@ -777,7 +777,8 @@ def _push(push: Callable) -> str | None:
     """`push(vertices, points, normals, epsilon, weight)`: (V, 3) newtons."""
     normals = np.array([[0.0, 0, 1], [0, 0, 1], [0.6, 0, 0.8]])
     points = np.array([[1.0, 2, 3], [0, 0, 0], [0, 0, 0]])
-    vertices = points + [[0, 0, -0.002], [0, 0, 0.005], [0.01, 0, -0.01]]
+    moved = np.array([[0, 0, -0.002], [0, 0, 0.005], [0.01, 0, -0.01]])
+    vertices = points + moved
 
     def of(vertices, points, normals):
         given = vertices.copy(), points.copy(), normals.copy()
@@ -811,7 +812,8 @@ def _for_engine(for_engine: Callable) -> str | None:
     if len(larger) == 3 or smaller.shape == (3, 3):
         return "the middle target is never used: leave it out"
     if smaller.shape != (3, 2) or larger.shape != (2, 2, 3):
-        return f"(3, 2) amounts of (2, 2, 3) targets, not {smaller.shape} of {larger.shape}"
+        shapes = f"{smaller.shape} of {larger.shape}"
+        return f"(3, 2) amounts of (2, 2, 3) targets, not {shapes}"
     if smaller.max() > 1 + 1e-6:
         return "an amount above 1 is clamped"
     moved = [np.tensordot(a, t, 1) for a, t in ((smaller, larger), (amounts, targets))]

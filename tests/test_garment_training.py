@@ -16,6 +16,7 @@ from skinlib.garments import training
 from skinlib.garments.binding import signed_distance
 from skinlib.garments.collision import vertex_normals
 from skinlib.garments.energies import EnergyWeights, total_energy
+from skinlib.garments.garment import Garment
 from skinlib.garments.motion import Motion
 from skinlib.garments.outfit import Outfit, load_outfit
 from skinlib.garments.pbns import PBNSConfig
@@ -36,6 +37,15 @@ def outfit() -> Outfit:
 @pytest.fixture(scope="module")
 def layers() -> Outfit:
     return Outfit.create(small_body(), [sleeve(0.115), band(0.13)])
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Sums in several threads may differ in their last bits."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def same(a, b) -> bool:
@@ -124,8 +134,13 @@ def test_a_signal_waits_for_the_end_of_an_update(outfit, tmp_path, monkeypatch):
         return step(self, *args)
 
     monkeypatch.setattr(torch.optim.Adam, "step", struck)
-    with pytest.raises(KeyboardInterrupt):
-        trainer.step()
+    # Where tests run in the background, the signal is ignored.
+    usual = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            trainer.step()
+    finally:
+        signal.signal(signal.SIGINT, usual)
     assert trainer.steps_done == 1 and trainer.recent
     assert trainer.network.columns.abs().max() > 0
 
@@ -148,6 +163,11 @@ def test_another_run_is_kept_from_the_folder(outfit, tmp_path, change, message):
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
+def backwards(garment: Garment) -> Garment:
+    """The same cloth with its faces in another order."""
+    return Garment.create(garment.vertices, garment.faces[::-1], name=garment.name)
+
+
 def moved_joints(body):
     bones = body.head.skeleton
     joints = bones.joints + np.float32([0, 0, 0.01])
@@ -161,7 +181,8 @@ def moved_joints(body):
         lambda o, p: (Outfit(o.body, (sleeve(0.116),)), p),
         lambda o, p: (Outfit(o.body, (sleeve(0.115, pinned=True),)), p),
         lambda o, p: (Outfit(o.body, (sleeve(0.115), band())), p),
-        lambda o, _: (o, bends(seed=1)),
+        lambda o, p: (Outfit(o.body, (backwards(o.garments[0]),)), p),
+        lambda o, p: (o, Motion.create(-p.rotations, p.bone_names, p.translations)),
         lambda o, p: (o, Motion.create(p.rotations, p.bone_names)),
         lambda o, p: (Outfit(moved_joints(o.body), o.garments), p),
         lambda o, p: (
@@ -175,7 +196,7 @@ def moved_joints(body):
             p,
         ),
     ],
-    ids="garment pins garments poses path joints weights".split(),
+    ids="garment pins garments faces poses path joints weights".split(),
 )
 def test_other_meshes_are_another_run(outfit, tmp_path, change):
     train(CONFIG, outfit, tmp_path, bends())
@@ -408,7 +429,7 @@ def test_shapes_are_learnt(outfit, tmp_path):
     config = replace(CONFIG, steps=10, shapes=True)
     trainer = Trainer(config, outfit, tmp_path, bends(200))
     assert trainer.shapes.abs().max() <= 0.6 and trainer.shapes.abs().max() > 0.5
-    assert trainer.ease.min() >= -0.05 and trainer.ease.max() <= 0.1
+    assert -0.05 <= trainer.ease.min() < -0.04 and 0.09 < trainer.ease.max() <= 0.1
     # The springs are as long as the cloth is cut for each body, times the ease.
     lengths = trainer._rest_lengths(torch.tensor([[0.0, 0]]), torch.tensor([0.1]))
     expected = outfit.cloth.rest_lengths * 1.1

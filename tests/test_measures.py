@@ -80,6 +80,9 @@ def test_a_garment_is_judged_as_it_is_cut_for_a_shape(outfit):
     assert found.elongation == pytest.approx(0, abs=1e-3)
     assert (found.inside, found.turned) == (0, 0)
     assert measure(outfit, still(2), posed).elongation > 1
+    # The bones of that body are longer, too.
+    bent = bends(3, angle=0.5)
+    assert measure(outfit, bent, skinned(outfit, bent, shape), shape).inside == 0
 
 
 @pytest.mark.parametrize(("radius", "turned"), [(0.115, 2), (0.13, 0)])

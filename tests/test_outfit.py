@@ -103,15 +103,24 @@ def test_at_most_eight_bones_a_vertex(outfit):
 
 
 def test_the_network_reads_the_bones_that_move_cloth_or_what_it_lies_on(outfit):
-    # The lowest bone is the root; the band reaches nothing of the others alone.
+    # The first bone is the root: what the network reads of it is which way is up.
     assert outfit.network(SMALL, 0, False, 0).bones.tolist() == [1, 2]
-    head = outfit.body.head
-    weights = np.zeros_like(head.weights)
-    weights[:, 0] = 1
-    still = replace(outfit.body, head=head.replace(weights=weights))
-    network = Outfit(still, outfit.garments).network(SMALL, 0, False, 0)
-    assert network.bones.tolist() == []
-    assert network.inputs(bends().rotations).shape == (12, 3)
+
+    def bones(bone_of: np.ndarray) -> list[int]:
+        """Those that are read when each vertex of the body has one bone."""
+        head = outfit.body.head.replace(weights=np.eye(3)[bone_of])
+        worn = Outfit(replace(outfit.body, head=head), outfit.garments)
+        network = worn.network(SMALL, 0, False, 0)
+        assert network.inputs(bends().rotations).shape == (
+            12,
+            3 * len(network.bones) + 3,
+        )
+        return network.bones.tolist()
+
+    height = outfit.body.head.vertices[:, 2]
+    assert bones(0 * height.astype(int)) == []
+    # The sleeve ends at 0.8, but can touch what is a little higher.
+    assert bones(np.where(height > 0.82, 2, 0)) == [2]
 
 
 # --- what is refused ------------------------------------------------------------------

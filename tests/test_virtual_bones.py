@@ -605,15 +605,25 @@ def test_what_it_returns_is_rigid(rig, rotate):
     assert torch.equal(turns, carrier[..., :3, :3]) != rotate
 
 
-def test_one_at_the_output_shifts_a_bone_by_reach(rig):
+def test_the_output_shifts_a_bone_by_metres(rig):
     read, carrier = sequences(rig)
-    net = network(rotate=False, reach=0.25)
+    net = network(rotate=False)
     with torch.no_grad():
-        net.decoder[-1].bias[4] = 1  # Y of the second bone
+        net.decoder[-1].bias[4] = 0.25  # Y of the second bone
         moved = net(read, carrier) - carrier
     assert moved[..., 1, 1, 3].allclose(torch.tensor(0.25), atol=1e-6)
     moved[..., 1, 1, 3] = 0
     assert not moved.any()
+
+
+def test_the_output_turns_a_bone_about_the_axes_of_the_root(rig):
+    read, carrier = sequences(rig)
+    net = network()
+    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    with torch.no_grad():
+        net.decoder[-1].bias[3:9] = (quarter - torch.eye(3))[:, :2].T.reshape(6)
+        found = net(read, carrier)[..., 0, :3, :3]
+    assert (found - quarter @ carrier[..., 0, :3, :3]).abs().max() < 1e-6
 
 
 def test_a_stream_equals_the_batch(rig):
@@ -693,7 +703,7 @@ def test_features_are_standardised(rig):
 
 def test_the_description_makes_the_same_network(rig):
     read, carrier = sequences(rig)
-    net = network(trained=True, rotate=False, reach=0.05)
+    net = network(trained=True, rotate=False)
     net.standardise(read)
     told = net.describe()
     sizes = told.pop("inputs"), told.pop("bones")

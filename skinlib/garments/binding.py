@@ -140,17 +140,20 @@ def layers_apart(inner: Garment, outer: Garment) -> int:
     return int(through.sum())
 
 
-def signed_distance(points, vertices, faces) -> np.ndarray:
+def signed_distance(
+    points: np.ndarray, vertices: np.ndarray, faces: np.ndarray
+) -> np.ndarray:
     """(N,) metres from points to a closed surface, negative inside.
 
     Inside is where the surface winds round a point, also where it runs through itself.
     """
     import igl
 
-    kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
-    return igl.signed_distance(
-        points.astype(np.float64), vertices.astype(np.float64), faces, kind
-    )[0]
+    points, vertices = points.astype(np.float64), vertices.astype(np.float64)
+    # Not `igl.signed_distance`: it multiplies by how often the surface winds round.
+    squared, _, _ = igl.point_mesh_squared_distance(points, vertices, faces)
+    inside = igl.fast_winding_number(vertices, faces, points) > 0.5
+    return np.where(inside, -1, 1) * np.sqrt(squared)
 
 
 def behind(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -203,7 +203,7 @@ class EnergyWeights:
 
     edge: float = 15.0
     bend: float = 5e-4  # the source: 5e-5
-    collision: float = 250.0  # the source: 25
+    collision: float = 400.0  # the source: 25
     gravity: float = 1.0
     pin: float = 10.0
     layer: float = 250.0  # the source: 25

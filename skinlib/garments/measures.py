@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 import igl
 import numpy as np
 import torch
+from tqdm.auto import tqdm
 
 from skinlib import geometry
 from skinlib.garments.binding import behind, signed_distance
@@ -88,10 +89,11 @@ def measure(
         _inside_out(*frame, head.faces)
         for frame in zip(corners, normals, bodies, strict=True)
     ]
+    pairs = list(zip(posed, bodies, strict=True))
     depths = np.stack(
         [
             signed_distance(points, skin, head.faces)
-            for points, skin in zip(posed, bodies, strict=True)
+            for points, skin in tqdm(pairs, "distances", leave=False, delay=2)
         ]
     )
     through = [

@@ -123,8 +123,9 @@ class Outfit:
         carried = np.zeros((0, len(weights), 3), np.float32)
         if shapes:
             carried = self._carried(self.body.shape_vertices)
-        torch.manual_seed(seed)
-        return PBNS(self.vertices, weights, np.flatnonzero(moved), carried, config)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            return PBNS(self.vertices, weights, np.flatnonzero(moved), carried, config)
 
     def _carried(self, shapes: np.ndarray) -> np.ndarray:
         """(K, V, 3) what the shapes of the body do to the cloth: what they do below."""

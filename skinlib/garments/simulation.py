@@ -18,8 +18,10 @@ Symbols: T frames, V garment vertices, B body vertices, J bones.
 
 import json
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import cache
+from multiprocessing import get_context
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -35,7 +37,7 @@ from skinlib.garments.energies import GRAVITY, Cloth
 from skinlib.garments.garment import Garment
 from skinlib.garments.motion import Motion
 from skinlib.geometry import mesh_edges
-from skinlib.head import Head, HeadError
+from skinlib.head import Head, HeadError, Skeleton
 from skinlib.io import atomic
 from skinlib.skinning import linear_blend_skinning
 from skinlib.training.checkpoint import replace_file
@@ -59,12 +61,13 @@ class SimulationConfig:
         HeadError: a value out of its range.
     """
 
-    rate: float = 360.0  # substeps a second, each with one pass over the constraints
+    rate: float = 1440.0  # substeps a second, each with one pass over the constraints
+    searches: float = 360.0  # a second, for the skin below each vertex
     density: float = 0.3  # kg/m^2
     stretch: float = 0.0  # m/N, how far edges give way
     bend: float = 10.0  # m/N, how far springs from vertex to vertex across edges do
     damping: float = 1.0  # 1/s, by the air
-    smoothing: float = 0.35  # a substep: of the way to the velocity of the neighbours
+    smoothing: float = 300.0  # 1/s, at which velocities get like those of neighbours
     thickness: float = 0.006  # that the cloth keeps from the skin
     friction: float = 0.3
     fastest: float = 10.0  # m/s
@@ -73,7 +76,7 @@ class SimulationConfig:
     bones: tuple[str, ...] = ()  # that cloth collides with; none: see `touched_bones`
 
     def __post_init__(self):
-        ranges = {"rate": (1, 1e5), "density": (1e-6, 1e6), "smoothing": (0, 1)}
+        ranges = {"rate": (1, 1e5), "searches": (1, 1e5), "density": (1e-6, 1e6)}
         for name, value in asdict(self).items():
             if name == "bones":
                 continue
@@ -223,111 +226,124 @@ class Simulator:
     def _run(
         self, transforms: np.ndarray, start: np.ndarray, fps: float
     ) -> Iterator[np.ndarray]:
-        """(V, 3) in each frame of the bones' transforms (T, J, 4, 4)."""
-        import warp as wp
+        """(V, 3) in each frame of the bones' transforms (T, J, 4, 4).
 
-        config, kernels = self.config, self.kernels
-        substeps = max(1, round(config.rate / fps))
-        step = 1 / (fps * substeps)
-        bodies, pins = self._skinned(transforms[0])
-        x, body, pin = self._points(start), self._points(bodies), self._points(pins)
-        before, v, smoothed = (wp.zeros_like(x) for _ in range(3))
-        body_next, pin_next = wp.clone(body), wp.clone(pin)
-        skin, motion = wp.clone(body), wp.zeros_like(body)
-        faces = self._array(self.obstacle.faces.numpy().ravel(), int)
-        mesh = wp.Mesh(points=skin, indices=faces, velocities=motion)
+        Positions are taken from where the root begins the frame: float32 is too coarse
+        for the steps of a body that has walked away.
+        """
+        skeleton = self.head.skeleton
+        root = int(np.flatnonzero(skeleton.parents < 0)[0])
+        turned, moved = transforms[:, root, :3, :3], transforms[:, root, :3, 3]
+        origins = turned @ skeleton.joints[root] + moved  # (T, 3)
 
-        def launch(kernel, count, *inputs):
-            return wp.launch(
-                kernel,
-                dim=count,
-                inputs=inputs,
-                device=self.device,
-                record_cmd=True,
-            )
-
-        count, inverse = len(start), self._inverse
-        speeds = smoothed if config.smoothing else v
-        now = wp.zeros(1, dtype=wp.float32, device=self.device)
-        commands = [
-            launch(kernels.clock, 1, now, 1 / substeps),
-            launch(
-                kernels.move_body, len(bodies), body, body_next, now, fps, skin, motion
-            ),
-            mesh.refit,
-            launch(
-                kernels.advance,
-                count,
-                x,
-                before,
-                speeds,
-                inverse,
-                pin,
-                pin_next,
-                now,
-                step,
-                float(np.exp(-config.damping * step)),
-                GRAVITY,
-            ),
-        ]
-        for colours, ids, lengths, compliance in self._springs:
-            soft = compliance / step**2
-            commands += [
-                launch(
-                    kernels.project, size, x, inverse, ids, lengths, first, float(soft)
-                )
-                for first, size in colours
-            ]
-        commands += [
-            launch(
-                kernels.collide,
-                count,
-                mesh.id,
-                x,
-                before,
-                inverse,
-                step,
-                config.thickness,
-                DEEPEST,
-                config.friction,
-            ),
-            launch(kernels.measure, count, x, before, v, step, config.fastest),
-        ]
-        if config.smoothing:
-            commands.append(
-                launch(
-                    kernels.calm,
-                    count,
-                    v,
-                    smoothed,
-                    inverse,
-                    *self._near,
-                    config.smoothing,
-                )
-            )
-        calls = [getattr(command, "launch", command) for command in commands]
+        bodies, pins = self._skinned(transforms[0], origins[0])
+        arrays = self._arrays(start - origins[0], bodies, pins)
+        substeps = max(1, round(self.config.rate / fps))
+        every = max(1, round(self.config.rate / self.config.searches))
+        program = self._program(arrays, fps, substeps)
         yield start.astype(np.float32)
-        for number, frame in enumerate(transforms[1:], start=1):
-            wp.copy(body, body_next)
-            wp.copy(pin, pin_next)
-            bodies, pins = self._skinned(frame)
-            body_next.assign(bodies)
-            pin_next.assign(pins)
-            now.zero_()
-            for _ in range(substeps):
-                for call in calls:
+        for number in range(1, len(transforms)):
+            origin = origins[number - 1]
+            shift = origin - origins[max(number - 2, 0)]
+            arrays.x.assign(arrays.x.numpy() - shift)
+            arrays.body.assign(bodies - shift)
+            arrays.pin.assign(pins - shift)
+            bodies, pins = self._skinned(transforms[number], origin)
+            arrays.body_next.assign(bodies)
+            arrays.pin_next.assign(pins)
+            arrays.now.zero_()
+            for left in reversed(range(substeps)):
+                # The search takes longer than all else; the last one is never stale.
+                for call in program[left % every == 0]:
                     call()
-            posed = x.numpy().copy()
+            posed = arrays.x.numpy() + origin
             if not np.isfinite(posed).all():
                 raise FloatingPointError(
                     f"the garment's positions are not finite in frame {number}: raise "
-                    f"rate ({config.rate:g})"
+                    f"rate ({self.config.rate:g})"
                 )
             yield posed
 
-    def _skinned(self, transforms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _arrays(
+        self, start: np.ndarray, bodies: np.ndarray, pins: np.ndarray
+    ) -> SimpleNamespace:
+        """What changes from one substep to the next."""
+        import warp as wp
+
+        x, body, pin = self._points(start), self._points(bodies), self._points(pins)
+        skin, motion = wp.clone(body), wp.zeros_like(body)
+        faces = self._array(self.obstacle.faces.numpy().ravel(), int)
+        count, device = len(start), self.device
+        return SimpleNamespace(
+            x=x,
+            before=wp.clone(x),
+            v=wp.zeros_like(x),
+            smoothed=wp.zeros_like(x),
+            body=body,
+            body_next=wp.clone(body),
+            pin=pin,
+            pin_next=wp.clone(pin),
+            now=wp.zeros(1, dtype=wp.float32, device=device),
+            skin=skin,
+            motion=motion,
+            mesh=wp.Mesh(points=skin, indices=faces, velocities=motion),
+            contact=(
+                wp.full(count, -1, dtype=wp.int32, device=device),
+                wp.zeros(count, dtype=wp.vec2, device=device),
+                wp.zeros(count, dtype=wp.vec3, device=device),
+            ),
+        )
+
+    def _program(
+        self, arrays: SimpleNamespace, fps: float, substeps: int
+    ) -> tuple[list, list]:
+        """The calls of a substep, without and with a search for the skin."""
+        import warp as wp
+
+        def launch(kernel, count, *inputs):
+            options = {"device": self.device, "record_cmd": True}
+            return wp.launch(kernel, dim=count, inputs=inputs, **options).launch
+
+        a, k, config, inverse = arrays, self.kernels, self.config, self._inverse
+        count, step = len(a.x), 1 / (fps * substeps)
+        kept, calm = (
+            float(np.exp(-rate * step)) for rate in (config.damping, config.smoothing)
+        )
+        speeds = a.smoothed if config.smoothing else a.v
+        pins = a.pin, a.pin_next, a.now
+        bodies = a.body, a.body_next, a.now
+        first = [
+            launch(k.clock, 1, a.now, 1 / substeps),
+            launch(k.move_body, len(a.body), *bodies, fps, a.skin, a.motion),
+            a.mesh.refit,
+            launch(k.advance, count, a.x, a.before, speeds, inverse, *pins, step, kept),
+        ]
+        for colours, ids, lengths, compliance in self._springs:
+            soft = compliance / step**2
+            first += [
+                launch(k.project, size, a.x, inverse, ids, lengths, place, soft)
+                for place, size in colours
+            ]
+        mesh, touch = a.mesh.id, (config.thickness, config.friction)
+        reach = config.thickness + DEEPEST
+        search = launch(k.search, count, mesh, a.x, inverse, reach, *a.contact)
+        last = [
+            launch(k.push, count, mesh, a.x, a.before, *a.contact, step, *touch),
+            launch(k.measure, count, a.x, a.before, a.v, step, config.fastest),
+        ]
+        if config.smoothing:
+            last.append(
+                launch(k.calm, count, a.v, a.smoothed, inverse, *self._near, 1 - calm)
+            )
+        return [*first, *last], [*first, search, *last]
+
+    def _skinned(
+        self, transforms: np.ndarray, origin: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """(B, 3) of the obstacle and (V, 3) of the garment: where bones bring them."""
         points, weights = self.obstacle.points.numpy(), self.obstacle.weights.numpy()
+        transforms = transforms.copy()
+        transforms[:, :3, 3] -= origin
         return (
             linear_blend_skinning(points, weights, transforms),
             linear_blend_skinning(self.garment.vertices, self.weights, transforms),
@@ -377,6 +393,7 @@ def _kernels() -> SimpleNamespace:
     level, wp.config.log_level = wp.config.log_level, wp.LOG_ERROR
     wp.init()  # else it writes what devices there are
     wp.config.log_level = max(level, wp.LOG_WARNING)
+    gravity = wp.constant(GRAVITY)
 
     @wp.kernel(enable_backward=False)
     def clock(now: wp.array[float], step: float):
@@ -407,9 +424,8 @@ def _kernels() -> SimpleNamespace:
         now: wp.array[float],
         step: float,
         kept: float,
-        gravity: float,
     ):
-        """Where vertices would go without constraints; pinned ones go with the bones."""
+        """Where vertices would go without constraints; pins go with the bones."""
         i = wp.tid()
         before[i] = x[i]
         if inverse[i] > 0.0:
@@ -439,38 +455,61 @@ def _kernels() -> SimpleNamespace:
             x[b] = x[b] - across * (force * inverse[b])
 
     @wp.kernel(enable_backward=False)
-    def collide(
+    def search(
+        mesh: wp.uint64,
+        x: wp.array[wp.vec3],
+        inverse: wp.array[float],
+        reach: float,
+        face: wp.array[int],
+        place: wp.array[wp.vec2],
+        normals: wp.array[wp.vec3],
+    ):
+        """The point of the skin closest to each vertex, and the way out from there."""
+        i = wp.tid()
+        face[i] = -1
+        if inverse[i] == 0.0:
+            return
+        found = wp.mesh_query_point_sign_normal(mesh, x[i], reach)
+        if found.result:
+            face[i] = found.face
+            place[i] = wp.vec2(found.u, found.v)
+            skin = wp.mesh_eval_position(mesh, found.face, found.u, found.v)
+            away = (x[i] - skin) * found.sign
+            if wp.length(away) > 1.0e-6:
+                normals[i] = wp.normalize(away)
+            else:
+                normals[i] = wp.mesh_eval_face_normal(mesh, found.face)
+
+    @wp.kernel(enable_backward=False)
+    def push(
         mesh: wp.uint64,
         x: wp.array[wp.vec3],
         before: wp.array[wp.vec3],
-        inverse: wp.array[float],
+        face: wp.array[int],
+        place: wp.array[wp.vec2],
+        normals: wp.array[wp.vec3],
         step: float,
         thickness: float,
-        deepest: float,
         friction: float,
     ):
         """Push vertices out of the skin and let it drag them along."""
         i = wp.tid()
-        if inverse[i] == 0.0:
+        f = face[i]
+        if f < 0:
             return
-        found = wp.mesh_query_point_sign_normal(mesh, x[i], thickness + deepest)
-        if found.result:
-            skin = wp.mesh_eval_position(mesh, found.face, found.u, found.v)
-            away = (x[i] - skin) * found.sign
-            distance = wp.length(away) * found.sign
-            if distance < thickness:
-                normal = wp.normalize(away)
-                if wp.length(away) < 1.0e-7:
-                    normal = wp.mesh_eval_face_normal(mesh, found.face)
-                depth = thickness - distance
-                out = x[i] + depth * normal
-                drag = step * wp.mesh_eval_velocity(mesh, found.face, found.u, found.v)
-                slide = out - before[i] - drag
-                slide = slide - wp.dot(slide, normal) * normal
-                far = wp.length(slide)
-                if far > 0.0:
-                    out = out - slide * wp.min(1.0, friction * depth / far)
-                x[i] = out
+        u = place[i][0]
+        v = place[i][1]
+        normal = normals[i]
+        skin = wp.mesh_eval_position(mesh, f, u, v)
+        depth = thickness - wp.dot(x[i] - skin, normal)
+        if depth > 0.0:
+            out = x[i] + depth * normal
+            slide = out - before[i] - step * wp.mesh_eval_velocity(mesh, f, u, v)
+            slide = slide - wp.dot(slide, normal) * normal
+            far = wp.length(slide)
+            if far > 0.0:
+                out = out - slide * wp.min(1.0, friction * depth / far)
+            x[i] = out
 
     @wp.kernel(enable_backward=False)
     def measure(
@@ -508,7 +547,8 @@ def _kernels() -> SimpleNamespace:
         move_body=move_body,
         advance=advance,
         project=project,
-        collide=collide,
+        search=search,
+        push=push,
         measure=measure,
         calm=calm,
     )
@@ -601,15 +641,15 @@ def obstacle(garment: Garment, head: Head, bones: Sequence[str] = ()) -> Collide
     return part
 
 
-def _lead(motion: Motion, skeleton, frames: int) -> Motion:
+def _lead(motion: Motion, skeleton: Skeleton, frames: int) -> Motion:
     """From the rest pose to the first frame, at the place and heading of the latter."""
     root = int(np.flatnonzero(skeleton.parents < 0)[0])
     first = motion.rotations[0].astype(np.float64)
     turn = Rotation.from_rotvec(first[root])
     # The part of the turn that is about the vertical.
     quaternion = turn.as_quat() * [0, 0, 1, 1]
-    upright = np.linalg.norm(quaternion) > 1e-6
-    heading = Rotation.from_quat(quaternion if upright else [0, 0, 0, 1])
+    faces_somewhere = np.linalg.norm(quaternion) > 1e-6
+    heading = Rotation.from_quat(quaternion if faces_somewhere else [0, 0, 0, 1])
     share = np.linspace(0, 1, frames + 1)
     share = (3 - 2 * share) * share**2
     rotations = share[:, None, None] * first
@@ -620,6 +660,193 @@ def _lead(motion: Motion, skeleton, frames: int) -> Motion:
     rotations[-1] = first
     moved = np.repeat(motion.translations[:1], frames + 1, axis=0)
     return Motion.create(rotations, motion.bone_names, moved, motion.fps)
+
+
+# --- data sets ----------------------------------------------------------------------
+
+
+class Simulated(NamedTuple):
+    """One file of a data set: the motion of the body, and the garment in it."""
+
+    motion: Motion
+    posed: np.ndarray  # (T, V, 3) float32
+    rest: np.ndarray  # (V, 3) float32, settled
+
+
+def simulate_motions(
+    garment: Garment,
+    head: Head,
+    motions: Sequence[Motion],
+    out: str | Path,
+    config: SimulationConfig | None = None,
+    workers: int = 1,
+    device: str = "cpu",
+) -> list[Path]:
+    """Simulate a garment in many motions: one file each, in their order.
+
+    Called again after an interrupt it makes the files that are missing; they are the
+    same to the bit as those of a run without one, on one machine. More motions may be
+    added at the end.
+
+    Args:
+        out: a folder, made if need be. workers: processes.
+
+    Raises:
+        HeadError: `out` holds another data set; or as for `simulate`.
+    """
+    config, out = config or SimulationConfig(), Path(out)
+    paths = [out / f"motion_{number:04d}.npz" for number in range(len(motions))]
+    _begin(out, garment, head, config)
+    todo = []
+    for motion, path in zip(motions, paths, strict=True):
+        motion.transforms(head.skeleton)  # rather now than after an hour
+        if path.exists():
+            _check_same(motion, path)
+        else:
+            todo.append((motion, path))
+    bar = tqdm(total=len(motions), initial=len(motions) - len(todo), unit="motion")
+    with bar:
+        if not todo:
+            return paths
+        simulator = Simulator(garment, head, config, device)
+        rest = simulator.settled()
+        if workers < 2:
+            for motion, path in todo:
+                _write(path, motion, simulator, rest)
+                bar.update()
+            return paths
+        # A forked process could not use CUDA.
+        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+            job = garment, head, config, device, rest
+            pending = [pool.submit(_simulate_to, *job, *pair) for pair in todo]
+            try:
+                for done in as_completed(pending):
+                    done.result()
+                    bar.update()
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+    return paths
+
+
+def read_simulated(path: str | Path) -> Simulated:
+    """Read a file that `simulate_motions` wrote.
+
+    Raises:
+        HeadError: it cannot be read, or holds something else.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            fields = {key: arrays[key] for key in arrays.files}
+        motion = Motion.create(
+            fields["rotations"],
+            fields["bone_names"].tolist(),
+            fields["translations"],
+            float(fields["fps"]),
+            str(fields["name"]),
+            path,
+        )
+        posed, rest = fields["posed"], fields["rest"]
+    except Exception as error:  # whatever a damaged archive makes the libraries raise
+        raise HeadError(
+            "simulation",
+            f"it cannot be read ({type(error).__name__}: {str(error)[:200]})",
+            "delete the file and run the same simulation again",
+            path,
+        ) from error
+    fits = posed.shape == (len(motion), *rest.shape) and rest.shape[1:] == (3,)
+    if not fits or not (np.isfinite(posed).all() and np.isfinite(rest).all()):
+        raise HeadError(
+            "simulation",
+            f"posed of shape {posed.shape}, rest of shape {rest.shape} for "
+            f"{len(motion)} frames, or a number that is not finite",
+            "delete the file and run the same simulation again",
+            path,
+        )
+    return Simulated(motion, posed.astype(np.float32), rest.astype(np.float32))
+
+
+def _simulate_to(garment, head, config, device, rest, motion, path) -> None:
+    _write(path, motion, Simulator(garment, head, config, device), rest)
+
+
+def _write(path: Path, motion: Motion, simulator: Simulator, rest: np.ndarray) -> None:
+    posed = np.stack(list(simulator.frames(motion, rest)))
+    with atomic(path) as file:
+        np.savez_compressed(
+            file,
+            rotations=motion.rotations,
+            translations=motion.translations,
+            bone_names=np.array(motion.bone_names),
+            fps=np.float64(motion.fps),
+            name=np.array(motion.name),
+            posed=posed,
+            rest=rest,
+        )
+
+
+def _begin(out: Path, garment: Garment, head: Head, config: SimulationConfig) -> None:
+    """Note in the folder what is simulated there.
+
+    Raises:
+        HeadError: something else is.
+    """
+    arrays = {
+        "garment": (garment.vertices, garment.faces, garment.pinned),
+        "body": (head.vertices, head.faces, head.weights, head.skeleton.joints),
+    }
+    meshes = {
+        name: crc32(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
+        for name, parts in arrays.items()
+        if all(part is not None for part in parts)
+    }
+    run = json.loads(json.dumps(asdict(config) | meshes))
+    path = out / RUN
+    if not path.exists():
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise HeadError(
+                "out",
+                f"no folder can be made ({error.strerror})",
+                "choose another",
+                out,
+            ) from error
+        replace_file(path, f"{json.dumps(run, indent=1)}\n".encode())
+        return
+    try:
+        before = dict(json.loads(path.read_bytes()))
+    except (OSError, ValueError, TypeError) as error:
+        raise HeadError(
+            "simulation", "it cannot be read", "choose a new folder", path
+        ) from error
+    differs = [key for key in run if before.get(key) != run[key]]
+    if differs:
+        raise HeadError(
+            ", ".join(differs),
+            "another simulation, with other settings or meshes, was begun here",
+            "continue it with the arguments it was begun with, or choose a new folder",
+            out,
+        )
+
+
+def _check_same(motion: Motion, path: Path) -> None:
+    before = read_simulated(path).motion
+    same = before.fps == motion.fps and all(
+        np.array_equal(a, b)
+        for a, b in (
+            (before.rotations, motion.rotations),
+            (before.translations, motion.translations),
+        )
+    )
+    if not same:
+        raise HeadError(
+            "motion",
+            "another one was simulated here",
+            "give the same motions in the same order, or choose a new folder",
+            path,
+        )
 
 
 # --- how good it is -----------------------------------------------------------------
@@ -640,8 +867,8 @@ def strain(posed: np.ndarray, rest: np.ndarray, faces: np.ndarray) -> Strain:
     Args:
         posed: (T, V, 3). rest: (V, 3) as cut, not settled. faces: (F, 3).
 
-    >>> triangle = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    >>> float(round(strain(1.1 * triangle[None], triangle, np.array([[0, 1, 2]])).p99, 6))
+    >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    >>> round(strain(1.1 * corners[None], corners, np.array([[0, 1, 2]])).p99, 6)
     0.1
     """
     a, b = mesh_edges(faces).T

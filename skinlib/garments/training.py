@@ -1,9 +1,10 @@
 """Training PBNS: potential energies in, a garment out; no simulated cloth is needed.
 
 Step s of a run depends on the seed, s and the parameters alone, so a run that was
-interrupted ends in the same bits as one that was not.
+interrupted ends in the same bits as one that was not, if the threads are as many.
 """
 
+import copy
 import json
 import time
 from collections.abc import Sequence
@@ -55,7 +56,7 @@ class GarmentConfig:
     epsilon: float = 0.004  # metres that the cloth keeps from the body, and layers
     shapes: bool = False  # learn the shapes of the body and looser cuts, too
     seed: int = 0  # of parameters, poses and their order
-    threads: int = 2
+    threads: int = 2  # another number, other last bits
     device: str = "cpu"
     save_seconds: float = 60.0  # how often the state to resume from is written
     energies: EnergyWeights = field(default_factory=EnergyWeights)
@@ -102,8 +103,8 @@ class Trainer:
         self.network = outfit.network(
             config.network, config.smoothing, config.shapes, config.seed
         ).to(device)
-        self.cloth = outfit.cloth.to(device)
-        self.collider = outfit.collider.to(device)
+        self.cloth = copy.deepcopy(outfit.cloth).to(device)
+        self.collider = copy.deepcopy(outfit.collider).to(device)
         self.pinned = torch.from_numpy(outfit.pinned).to(device)
         self._draw(poses)
         self.parameters = list(self.network.parameters())
@@ -213,6 +214,8 @@ class Trainer:
 
     def _check_hold(self, ids: np.ndarray) -> None:
         """Stop when a garment slides off: gravity alone would go on for ever."""
+        if not self.config.energies.collision:
+            return  # it falls through the body, as was asked for
         with torch.no_grad():
             drop = -self.network.offsets(self.inputs[ids])[..., 2].mean(0)
         for garment, part in zip(self.outfit.garments, self.outfit.parts, strict=True):
@@ -221,8 +224,8 @@ class Trainer:
                     "pinned",
                     f"{garment.name or 'the garment'} has slid down by "
                     f"{drop[part].mean():.2f} m after {self.steps_done} steps",
-                    "pin it at the waist (--pin-top, --pin-above), or choose another "
-                    "rest position",
+                    "pin it at the waist (--pin-top, --pin-above) and begin in a new "
+                    "folder",
                 )
 
     def energies(self, ids: np.ndarray) -> dict[str, Tensor]:

@@ -364,7 +364,8 @@ def hybrid_skinning(
 ) -> Array:
     """(..., V, 3) posed vertices: sum_c w_c T_c O_c v. Equation `hybrid_skinning`.
 
-    numpy arrays or torch tensors in, the same out.
+    numpy arrays or torch tensors in, the same out. A stream that runs the network in
+    torch had better skin there, too: two libraries' threads are in each other's way.
 
     Args:
         rest: (V, 3). weights: (V, C), virtual bones and joints.
@@ -581,7 +582,6 @@ class VirtualBonesConfig:
 
     hidden: int = 128  # width of all layers and of the memory
     rotate: bool = True  # bones turn; else they only shift: 3 numbers instead of 9
-    reach: float = 0.1  # metres that 1 at the output shifts a bone
 
 
 class VirtualBonesNet(nn.Module):
@@ -672,7 +672,7 @@ class VirtualBonesNet(nn.Module):
         hidden = self.encoder((features - self.mean) / self.scale)
         hidden, state = self.memory(hidden, state)
         change = self.decoder(hidden).unflatten(-1, (self.bones, -1))
-        place = carrier[..., :3, 3:] + self.config.reach * change[..., :3, None]
+        place = carrier[..., :3, 3:] + change[..., :3, None]
         turned = carrier[..., :3, :3]
         if self.config.rotate:
             turned = rotation_from_columns(change[..., 3:]) @ turned

@@ -42,7 +42,7 @@ COVER = 0.03
 
 UPPER = scenes.View(20.0, 4.0, zoom=1.75, centre=(0.0, 0.0, 0.42), upright=True)
 WHOLE = scenes.View(20.0, 4.0, zoom=0.9, upright=True)
-TILE = (300, 320)
+TILE = (240, 256)
 
 # What is painted -> the label of its colour bar and its upper end.
 PAINTS = {"depth": ("mm inside the body", 10.0), "stretch": ("edges off by, %", 25.0)}
@@ -158,6 +158,11 @@ def painted(
     return draw(outfit, one, still, 0, values, high=PAINTS[paint][1], **how)
 
 
+def grid(images: Sequence, titles: Sequence[str] | None = None, **how) -> Picture:
+    """`picture_grid` in 60 kB: bodies are smooth, and a page shows many of them."""
+    return replace(picture_grid(images, titles, **how), max_bytes=60_000)
+
+
 def colour_bar(paint: str) -> ColourBar | None:
     """What the colours of a paint mean; nothing for `"cloth"`."""
     if paint == "cloth":
@@ -213,7 +218,7 @@ def posture_picture(
     motion = posture(outfit, **degrees)
     view = replace(UPPER, azimuth=view_from)
     both = skinned(outfit, motion), outfit.pose(network, motion)
-    return picture_grid(
+    return grid(
         [painted(outfit, motion, p, paint, view=view, size=size) for p in both],
         ["skinning alone", "PBNS"],
         colour_bar=colour_bar(paint),
@@ -250,11 +255,11 @@ def strip(
     *,
     paint: str = "cloth",
     view: scenes.View = WHOLE,
-    size: tuple[int, int] = (150, 300),
+    size: tuple[int, int] = (130, 260),
     title: str | None = None,
 ) -> Picture:
     """Some frames of a motion side by side."""
-    return picture_grid(
+    return grid(
         [
             painted(outfit, motion, posed, paint, f, view=view, size=size)
             for f in frames
@@ -283,7 +288,7 @@ def playback(
     def show(frame: int, paint: str) -> Picture:
         image = painted(outfit, motion, posed, paint, frame, view=view, size=size)
         bar = colour_bar(paint)
-        return picture_grid([image], [f"frame {frame}"], colour_bar=bar)
+        return grid([image], [f"frame {frame}"], colour_bar=bar)
 
     last = len(motion) - 1
     lab = slider_lab(show, frame=(0, last), paint=["cloth", *PAINTS])
@@ -364,7 +369,7 @@ def drape_picture(
     weights = EnergyWeights(edge, bend, collision, gravity, pin)
     posed, _ = drape(outfit, motion, weights, steps)
     inside = depth_inside(outfit, motion, posed) > 0
-    return picture_grid(
+    return grid(
         [painted(outfit, motion, posed, paint, view=view, size=size)],
         caption=f"inside {100 * inside.mean():.1f} %, "
         f"edges off by {stretch(outfit, posed).mean():.1f} %",
@@ -497,7 +502,7 @@ def columns_picture(
     count: int = 5,
     *,
     high: float = 30.0,
-    size: tuple[int, int] = (200, 230),
+    size: tuple[int, int] = (170, 196),
     title: str | None = None,
 ) -> Picture:
     """The strongest columns of D: what each moves, and the pose that uses it most.
@@ -507,7 +512,8 @@ def columns_picture(
         high: millimetres at the upper end of the colours.
     """
     used, moves = column_use(network, motion)
-    strongest = np.argsort(-(used * moves.max(axis=1)).max(axis=0))[:count]
+    reach = used.max(axis=0) * moves.max(axis=1)
+    strongest = np.argsort(-reach, kind="stable")[:count]
     frames = used[:, strongest].argmax(axis=0)
     posed = outfit.pose(network, motion)
     still = posture(outfit, hip=0.0)
@@ -519,7 +525,7 @@ def columns_picture(
         for h, f in zip(strongest, frames, strict=True)
     ]
     tiles += [draw(outfit, motion, posed, int(f), size=size) for f in frames]
-    return picture_grid(
+    return grid(
         tiles,
         [f"column {h}" for h in strongest],
         columns=count,

@@ -32,6 +32,10 @@ head = synthetic_head(3)
 pose_sliders(head)
 """,
     "bone": "bone_picker(head)",
+    "press": """
+from skinlib.views.garments import press_lab
+press_lab()
+""",
 }
 RUN_ALL = """async () => {
     const widget = jupyterapp.shell.currentWidget;
@@ -121,7 +125,7 @@ def page(lab):
             "window.jupyterapp?.shell?.currentWidget", timeout=90_000
         )
         page.evaluate(RUN_ALL)
-        page.locator(".widget-image").nth(1).wait_for(timeout=120_000)
+        page.locator(".widget-image").nth(len(CELLS) - 1).wait_for(timeout=120_000)
         yield page
         browser.close()
 
@@ -164,4 +168,16 @@ def test_a_menu_shows_another_bone(page):
     _wait_for_new_picture(page, 1, old)
     page.wait_for_timeout(1000)
     _keep(page, "bone")
+    assert page.evaluate(ERRORS) == []
+
+
+def test_steps_push_the_cloth_out_of_the_body(page):
+    old = _source(page, 2)
+    steps = page.locator(".widget-slider", has_text="steps").last
+    steps.locator(".noUi-handle").focus()
+    for _ in range(5):
+        page.keyboard.press("ArrowRight")
+    _wait_for_new_picture(page, 2, old)
+    page.wait_for_timeout(1000)
+    _keep(page, "press")
     assert page.evaluate(ERRORS) == []
