@@ -74,7 +74,10 @@ HANGING, NEAREST = {"smoothing": 50}, {"smoothing": 0}
 EXPERIMENTS = {
     "t_shirt": Experiment(SHIRT, 12_000),
     "all_terms": Experiment(SHIRT, 4_000, energies=SOFTER),
-    "no_collision": Experiment(SHIRT, 4_000, energies={"collision": 0.0}),
+    # Without gravity, too: else the shirt falls through the body and lies below it.
+    "no_collision": Experiment(
+        SHIRT, 4_000, energies={"collision": 0.0, "gravity": 0.0}
+    ),
     "fixed_weights": Experiment(SHIRT, 4_000, energies=SOFTER, network=FIXED),
     "as_published": Experiment(SHIRT, 4_000, NEAREST, PUBLISHED, SOURCE),
     "skirt": Experiment(SKIRT, 6_000, HANGING, SOFTER),
