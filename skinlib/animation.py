@@ -81,7 +81,8 @@ def write_animation(
         path: where to; a file that is there already is replaced.
         rotations: (T, J, 3, 3) of each bone about its own joint, in the axes of the
             vertices; children follow, as in `skinlib.skinning.forward_kinematics`.
-        translations: (T, 3), how far the roots move; None for not at all.
+        translations: how far joints move besides, as in `forward_kinematics`: (T, 3)
+            for the roots alone, or (T, J, 3) for all; None for not at all.
         fps: frames per second.
         up: the axis of our data that points up: "Z" with the face towards -Y, or "Y"
             with the face towards +Z, which are the axes of glTF.
@@ -106,9 +107,7 @@ def write_animation(
     _check_size(np.size(rotations) + sum(sizes), path)
     rotations = _checked_rotations(rotations, skeleton, path)
     frames, axes = len(rotations), TO_GLTF[up]
-    if translations is None:
-        translations = np.zeros((frames, 3))
-    translations = _checked(translations, (frames, 3), "translations", path)
+    translations = _checked_translations(translations, skeleton, frames, path)
     times = _times(frames, fps, path)
 
     document = gltf.Document()
@@ -293,10 +292,15 @@ def _animate_bones(
     translations: np.ndarray,
     axes: np.ndarray,
 ) -> None:
-    """Channels for each bone that turns, and for where the roots are."""
-    for root in np.flatnonzero(skeleton.parents == -1).tolist():
-        places = skeleton.joints[root] + translations @ axes.T
-        _animate(document, times, root, "translation", places, "VEC3")
+    """Channels for each bone that turns or moves, and for where the roots are."""
+    moving = (translations != 0).any(axis=(0, 2)) | (skeleton.parents == -1)
+    for bone in np.flatnonzero(moving).tolist():
+        parent = skeleton.parents[bone]
+        # float64, as in the node: what does not move stays exactly where it was.
+        place = skeleton.joints[bone].astype(np.float64)
+        place -= skeleton.joints[parent] if parent >= 0 else 0
+        places = place + translations[:, bone] @ axes.T
+        _animate(document, times, bone, "translation", places, "VEC3")
     turning = (rotations != np.eye(3)).any(axis=(0, 2, 3))
     for bone in np.flatnonzero(turning).tolist():
         # A rotation in other axes keeps its angle, only its axis turns.
@@ -373,6 +377,20 @@ def _checked_rotations(
             path,
         )
     return rotations
+
+
+def _checked_translations(
+    values: np.ndarray | None, skeleton: Skeleton, frames: int, path: str | Path
+) -> np.ndarray:
+    """(T, J, 3)."""
+    shape = (frames, len(skeleton), 3)
+    if values is not None and values.ndim == 3:
+        return _checked(values, shape, "translations", path)
+    moved = np.zeros(shape, np.float32)
+    if values is not None:
+        values = _checked(values, (frames, 3), "translations", path)
+        moved[:, skeleton.parents == -1] = values[:, None]
+    return moved
 
 
 def _times(frames: int, fps: float, path: str | Path) -> np.ndarray:

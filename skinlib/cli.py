@@ -348,22 +348,83 @@ def bench(
     print(f"{page}: tables and figures")
 
 
+def garment_simulate(
+    mesh: Annotated[Positional[Path], arg(metavar="MESH")],
+    *,
+    out: Folder,
+    body: Annotated[Path | None, arg(metavar="FILE")] = None,
+    motions: Annotated[int, arg(metavar="N")] = 56,
+    poses: Annotated[tuple[Path, ...], arg(metavar="FILE ...")] = (),
+    pin_top: bool = False,
+    pin_above: Annotated[float | None, arg(metavar="Z")] = None,
+    seed: Annotated[int, arg(metavar="S")] = 0,
+    device: Annotated[str, arg(metavar="D")] = "cpu",
+    workers: Annotated[int, arg(metavar="P")] = 1,
+) -> None:
+    """Let a loose garment, such as a skirt, swing on a walking body, to learn from it.
+
+    MESH is a garment at rest on the body, as for `skinlib garment train`. Ctrl-C stops;
+    the same command goes on where it stopped, and may ask for more motions.
+
+    For example:
+      skinlib garment simulate data_samples/skirt.npz --out runs/swinging
+      skinlib garment train data_samples/skirt.npz --simulated runs/swinging \\
+        --out runs/skirt
+
+    Args:
+        mesh: The garment.
+        out: Folder for the simulations, one file for each motion.
+        body: Skinned body (.npz, see data_samples/README.md); else the shipped one.
+        motions: How many are drawn at random; three in four are walks.
+        poses: Simulate these motion files (.npz) instead.
+        pin_top: Hold the garment at its highest opening, as a skirt at the waist.
+        pin_above: Hold it at all vertices higher than Z metres.
+        seed: Same seed, same motions; another one for what is not to be learnt.
+        device: Where to compute, such as cpu or cuda.
+        workers: Processes.
+    """
+    from skinlib.garments.body import read_body
+    from skinlib.garments.loose import simulation_motions
+    from skinlib.garments.motion import read_motion
+    from skinlib.garments.outfit import Outfit
+    from skinlib.garments.simulation import simulate_motions
+
+    _check_numbers(("--motions", motions, 1), ("--workers", workers, 1))
+    _check_seed(seed)
+    device = _device(device)
+    outfit = Outfit.create(read_body(body), _garments([mesh], pin_top, pin_above))
+    head = outfit.body.head
+    chosen = [read_motion(path) for path in poses]
+    if not chosen:
+        chosen = simulation_motions(head.skeleton, seed, motions)
+    (garment,) = outfit.garments
+    if device.startswith("cuda") and ":" not in device:
+        device += ":0"  # Warp wants to know which one
+    simulate_motions(garment, head, chosen, out, workers=workers, device=device)
+    print(f"{out}: learn it with `skinlib garment train {mesh} --simulated {out}`")
+
+
 def garment_train(
     meshes: Annotated[Positional[tuple[Path, ...]], arg(metavar="MESH ...")],
     *,
     out: Folder,
     body: Annotated[Path | None, arg(metavar="FILE")] = None,
     poses: Annotated[Path | None, arg(metavar="FILE")] = None,
+    simulated: OptionalFolder = None,
+    bones: Annotated[int, arg(metavar="N")] = 24,
     pin_top: bool = False,
     pin_above: Annotated[float | None, arg(metavar="Z")] = None,
     shapes: bool = False,
     smooth: Annotated[int | None, arg(metavar="N")] = None,
-    steps: Annotated[int, arg(metavar="N")] = 10_000,
+    steps: Annotated[int | None, arg(metavar="N")] = None,
     seed: Annotated[int, arg(metavar="S")] = 0,
     device: Annotated[str, arg(metavar="D")] = "cpu",
     threads: Annotated[int, arg(metavar="T")] = min(2, os.cpu_count() or 1),
 ) -> None:
-    """Learn how a garment moves with a body, from physics alone: nothing is simulated.
+    """Learn how a garment moves with a body.
+
+    From physics alone, for what lies on the body; or, with --simulated, from a
+    simulation, for what swings, such as a skirt: on virtual bones, with a memory.
 
     MESH is a garment at rest on the body: .glb, .gltf, .obj, .ply, .stl or .npz, in
     metres. Name several from the skin outwards, and they learn to stay apart. Ctrl-C
@@ -373,6 +434,7 @@ def garment_train(
       skinlib garment train data_samples/t_shirt.npz --out runs/t_shirt
       skinlib garment train kilt.glb --out runs/kilt --pin-top --smooth 50
       skinlib garment train shirt.obj coat.obj --out runs/coat --body me.npz
+      skinlib garment train kilt.glb --out runs/kilt --simulated runs/swinging
       skinlib garment play runs/t_shirt --poses walk --out walk.glb
 
     Args:
@@ -380,40 +442,48 @@ def garment_train(
         out: Folder that all is written to; made when there is none.
         body: Skinned body (.npz, see data_samples/README.md); else the shipped one.
         poses: Motion (.npz) with the poses to learn; else 4,000 drawn at random.
+        simulated: What `skinlib garment simulate` wrote of this garment.
+        bones: How many virtual bones then move it.
         pin_top: Hold the garment at its highest opening, as a skirt at the waist.
         pin_above: Hold it at all vertices higher than Z metres.
         shapes: Learn the shapes of the body and looser cuts, too.
         smooth: Rounds of smoothing of the skin weights; 10, or 50 for what is pinned.
-        steps: How long to train: 10,000 steps are ten to fifteen minutes.
+        steps: How long to train: 10,000 steps unless simulated, which are ten to
+            fifteen minutes; then 800, a minute or two.
         seed: Same seed, same garment.
         device: Where to compute, such as cpu or cuda.
         threads: CPU cores to use.
     """
     from skinlib.garments.body import read_body
-    from skinlib.garments.garment import pin_boundary, read_garment
     from skinlib.garments.motion import read_motion
     from skinlib.garments.outfit import Outfit
     from skinlib.garments.training import GarmentConfig
     from skinlib.garments.training import train as train_garment
 
-    for name, value, least in (
-        ("--steps", steps, 1),
+    _check_numbers(
+        ("--steps", 1 if steps is None else steps, 1),
         ("--threads", threads, 1),
-        ("--seed", seed, 0),
         ("--smooth", smooth or 0, 0),
-    ):
-        if value < least:
-            raise HeadError(name, f"{value}", f"give {least} or more")
-    if seed >= 2**32:
-        raise HeadError("--seed", f"{seed}", "give 0 to 4294967295")
-    garments = [read_garment(mesh) for mesh in meshes]
-    if pin_top or pin_above is not None:
-        garments = [pin_boundary(garment, pin_above) for garment in garments]
+        ("--bones", bones, 1),
+    )
+    _check_seed(seed)
+    garments = _garments(meshes, pin_top, pin_above)
     outfit = Outfit.create(read_body(body), garments)
+    if simulated:
+        for name, given in (
+            ("--poses", poses),
+            ("--shapes", shapes),
+            ("--smooth", smooth),
+        ):
+            if given:
+                raise HeadError(name, "given with --simulated", "leave one of them out")
+        same = {"seed": seed, "device": _device(device), "threads": threads}
+        _train_loose(outfit, simulated, out, bones=bones, steps=steps, **same)
+        return
     if smooth is None:
         smooth = 50 if outfit.pinned.any() else 10
     config = GarmentConfig(
-        steps=steps,
+        steps=10_000 if steps is None else steps,
         smoothing=smooth,
         shapes=shapes,
         seed=seed,
@@ -424,6 +494,44 @@ def garment_train(
     print(
         f"{out}: play it with `skinlib garment play {out} --poses walk --out OUT.glb`"
     )
+
+
+def _train_loose(outfit, simulated: Path, out: Path, steps: int | None, **settings):
+    """Train a garment on virtual bones."""
+    from skinlib.garments.loose import LooseConfig, read_simulations, train
+
+    if len(outfit.garments) > 1:
+        raise HeadError("MESH", "several garments", "simulate and train one at a time")
+    if steps is not None:
+        settings["steps"] = steps
+    config, (garment,) = LooseConfig(**settings), outfit.garments
+    train(config, outfit.body, garment, read_simulations(simulated), out)
+    print(
+        f"{out}: play it with `skinlib garment play {out} --poses walk --out OUT.glb`"
+    )
+
+
+def _garments(meshes: Sequence[Path], pin_top: bool, pin_above: float | None) -> list:
+    """The meshes, pinned as asked for."""
+    from skinlib.garments.garment import pin_boundary, read_garment
+
+    garments = [read_garment(mesh) for mesh in meshes]
+    if pin_top or pin_above is not None:
+        garments = [pin_boundary(garment, pin_above) for garment in garments]
+    return garments
+
+
+def _check_numbers(*options: tuple[str, int, int]) -> None:
+    """Refuse what is below the least that makes sense."""
+    for name, value, least in options:
+        if value < least:
+            raise HeadError(name, f"{value}", f"give {least} or more")
+
+
+def _check_seed(seed: int) -> None:
+    _check_numbers(("--seed", seed, 0))
+    if seed >= 2**32:
+        raise HeadError("--seed", f"{seed}", "give 0 to 4294967295")
 
 
 def garment_play(
@@ -443,12 +551,14 @@ def garment_play(
     Args:
         folder: What `skinlib garment train` wrote.
         poses: Motion file (.npz), or walk, turn, squat or reach.
-        out: A .glb has the body, the bones and the garments, with the blend shapes
-            driven frame by frame; a .npz has the vertices of every frame.
+        out: A .glb has the body, the bones and the garments, with the blend shapes, or
+            the virtual bones, driven frame by frame; a .npz has the vertices of every
+            frame.
         shape: Of the body, such as `weight 0.5`, for a garment trained with --shapes.
         ease: By how much the cloth is cut wider, such as 0.05, for one trained so.
     """
     from skinlib.animation import write_vertex_cache
+    from skinlib.garments.loose import is_loose, load_loose
     from skinlib.garments.motion import MOTIONS, read_motion
     from skinlib.garments.outfit import load_outfit
 
@@ -461,14 +571,32 @@ def garment_play(
             f"there is no file and no motion {poses!r}",
             f"name a .npz file, or one of {', '.join(MOTIONS)}",
         )
-    outfit, network = load_outfit(folder)
-    skeleton = outfit.body.head.skeleton
+    if is_loose(folder):
+        if shape or ease:
+            raise HeadError(
+                "--shape" if shape else "--ease",
+                "this garment was simulated on one body",
+                "leave it out",
+            )
+        loose = load_loose(folder)
+        body, faces = loose.body, loose.garment.faces
+        pose, export = loose.pose, loose.export
+    else:
+        outfit, network = load_outfit(folder)
+        body, faces = outfit.body, outfit.faces
+
+        def pose(motion):
+            return outfit.pose(network, motion, shape, ease)
+
+        def export(path, motion):
+            outfit.export(path, network, motion, shape, ease)
+
+    skeleton = body.head.skeleton
     motion = read_motion(poses) if is_file else MOTIONS[poses](skeleton)
     if out.suffix.lower() == ".npz":
-        posed = outfit.pose(network, motion, shape, ease)
-        write_vertex_cache(out, posed, outfit.faces, motion.fps)
+        write_vertex_cache(out, pose(motion), faces, motion.fps)
     else:
-        outfit.export(out, network, motion, shape, ease)
+        export(out, motion)
     print(f"{out}: {len(motion)} frames at {motion.fps:g} a second")
 
 
@@ -476,6 +604,7 @@ def garment_evaluate(
     folder: Annotated[Positional[Path], arg(metavar="DIR")],
     *,
     poses: Annotated[Path | None, arg(metavar="FILE")] = None,
+    simulated: OptionalFolder = None,
     json_file: Annotated[Path | None, arg(name="json", metavar="FILE")] = None,
 ) -> None:
     """Judge a trained garment beside skinning alone, on poses it has not learnt.
@@ -483,27 +612,48 @@ def garment_evaluate(
     Args:
         folder: What `skinlib garment train` wrote.
         poses: Motion file (.npz); else eight motions that no training draws.
+        simulated: For one on virtual bones, the distance to these simulations, too, in
+            mm; of another seed than those it has learnt.
         json_file: Write the numbers to this file, too.
     """
     from dataclasses import asdict
 
+    from skinlib.garments.loose import KIND, errors, is_loose, load_loose
+    from skinlib.garments.loose import read_simulations as read_all
     from skinlib.garments.measures import joined, measure, skinned
     from skinlib.garments.motion import held_out_motions, read_motion
-    from skinlib.garments.outfit import load_outfit
+    from skinlib.garments.outfit import Outfit, load_outfit
     from skinlib.io import atomic
 
     _check_json(json_file)
-    outfit, network = load_outfit(folder)
+    loose, network = None, None
+    if is_loose(folder):
+        loose = load_loose(folder)
+        outfit = Outfit(loose.body, (loose.garment,))
+    else:
+        outfit, network = load_outfit(folder)
+    if simulated and not loose:
+        raise HeadError(
+            "--simulated", "this garment is not on virtual bones", "leave it out"
+        )
+    distances = errors(loose, read_all(simulated)) if loose and simulated else {}
     skeleton = outfit.body.head.skeleton
     motion = read_motion(poses) if poses else joined(held_out_motions(skeleton))
-    results = {
-        "skinning alone": measure(outfit, motion, skinned(outfit, motion)),
-        "PBNS": measure(outfit, motion, outfit.pose(network, motion)),
-    }
+    if loose:
+        alone = loose.baselines(motion)["skinning alone"]
+        posed = {"skinning alone": alone, KIND: loose.pose(motion)}
+    else:
+        alone = skinned(outfit, motion)
+        posed = {"skinning alone": alone, "PBNS": outfit.pose(network, motion)}
+    results = {name: measure(outfit, motion, found) for name, found in posed.items()}
     for name, result in results.items():
         print(f"{name}: {result.line()}")
+    for name, distance in distances.items():
+        print(f"{name}: {distance:.1f} mm from the simulation")
     if json_file:
         numbers = {name: asdict(result) for name, result in results.items()}
+        if distances:
+            numbers["mm from the simulation"] = distances
         with atomic(json_file) as file:
             file.write(f"{json.dumps(numbers, indent=1)}\n".encode())
 
@@ -547,7 +697,7 @@ def check() -> None:
 
 
 def garment() -> None:
-    """Learn how clothes move with a body, and play them: train, play, evaluate."""
+    """Learn how clothes move with a body: simulate, train, play, evaluate."""
 
 
 COMMANDS = {
@@ -563,6 +713,7 @@ COMMANDS = {
 
 GROUPS = {
     "garment": {
+        "simulate": garment_simulate,
         "train": garment_train,
         "play": garment_play,
         "evaluate": garment_evaluate,

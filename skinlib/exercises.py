@@ -822,3 +822,62 @@ def _for_engine(for_engine: Callable) -> str | None:
     if not same(smaller.max(axis=0), [1, 1]):
         return "each target is scaled by its own largest amount, which becomes 1"
     return None
+
+
+# ---- 16 virtual bones
+
+
+@exercise("16.1")
+def _heat(heat: Callable) -> str | None:
+    """`heat(distances, alpha, influences)`: (V, N) weights."""
+    distances = np.array([[0.0, 1, 2], [2, 1, 0], [500, 400, 300]])
+    found = np.asarray(heat(distances.copy(), 1.0, 3))
+    if found.shape != (3, 3):
+        return f"a weight for each of 3 vertices and 3 bones, not {found.shape}"
+    if same(found[0], np.exp([0, -1, -2]) / np.exp([0, -1, -2]).sum()):
+        return "the distance is squared"
+    if same(found[0], np.exp([0, -1, -4])):
+        return "the heat of a vertex is divided by its sum"
+    if not same(found[:2].sum(axis=1), [1, 1]):
+        return "rows sum to 1"
+    weights = np.exp([0, -1, -4]) / np.exp([0, -1, -4]).sum()
+    if not same(found[0], weights) or not same(found[1], weights[::-1]):
+        return "0, 1 and 2 m away, alpha 1 m: heat is 1, exp(-1) and exp(-4)"
+    if not np.isfinite(found[2]).all() or not same(found[2], [0, 0, 1]):
+        return "a vertex 300 m from the nearest bone belongs to that bone"
+    half = np.array(heat(0.5 * distances, 0.5, 3))
+    if not same(half[:2], found[:2]):
+        return "half the distances with half of alpha: the same weights"
+    few = np.asarray(heat(distances.copy(), 1.0, 2))
+    if (few[:2] > 0).sum(axis=1).max() > 2:
+        return "with two influences a row has at most two weights above 0"
+    if same(few[0], [*weights[:2], 0]):
+        return "first leave out all but the nearest, then divide by the sum"
+    if not same(few[:2].sum(axis=1), [1, 1]) or not same(few[1, 0], 0):
+        return "the bones that are left are the nearest, and their weights sum to 1"
+    return None
+
+
+@exercise("16.2")
+def _best_guess(best_guess: Callable) -> str | None:
+    """`best_guess(posed, period)`: (period, V, 3) and metres."""
+    posed = np.zeros((4, 2, 3))
+    posed[:, 0, 0] = 1, 5, 3, 5  # the cycles differ in the first frame, by 2 m
+    guess, off = best_guess(posed.copy(), 2)
+    guess, off = np.asarray(guess), float(off)
+    if guess.shape != (2, 2, 3):
+        return f"two frames of two vertices, not {guess.shape}"
+    if same(guess[:, 0, 0], [3, 4]):
+        return "frames of one cycle follow each other: 0, 1, and again 0, 1"
+    if not same(guess[:, 0, 0], [2, 5]) or guess[:, 1].any() or guess[..., 1:].any():
+        return "after 1, 5, 3, 5 the best guess of two frames is 2, 5"
+    # In two of four frames one of two vertices is off by 1 m.
+    if same(off, 0.25):
+        return "the root of the mean square, not the mean square"
+    if same(off, (1 / 12) ** 0.5):
+        return "a distance has three coordinates: sum over them, and mean over the rest"
+    if same(off, 2 * 0.5**0.5):
+        return "how far cycles are from the guess, not from each other"
+    if not same(off, 0.5):
+        return "2 of 8 places are 1 m off: the root of 2 / 8"
+    return None

@@ -242,6 +242,38 @@ def test_only_what_moves_has_channels_and_rotations_never_jump(tmp_path):
     assert np.allclose(hand[-1], -hand[0], atol=1e-6)  # a whole turn changes the sign
 
 
+def test_every_bone_may_move_besides(tmp_path):
+    skeleton, rotations, _, meshes = scene()
+    shifts = np.random.default_rng(2).normal(size=(len(rotations), 5, 3))
+    shifts[:, 1] = 0  # the wrist stays where the elbow takes it
+    path = tmp_path / "a.glb"
+    write_animation(path, skeleton, rotations, shifts, FPS, meshes)
+    player, mesh = Player(path), meshes[0]
+    transforms = forward_kinematics(skeleton, rotations, shifts)
+    for frame, (bones, amounts) in enumerate(
+        zip(transforms, mesh.morph_amounts, strict=True)
+    ):
+        rest = mesh.vertices + np.tensordot(amounts, mesh.morphs, 1)
+        posed = linear_blend_skinning(rest, mesh.weights, bones)
+        found = player.vertices("inner", frame)
+        assert np.abs(found - upright(posed)).max() < 1e-4
+    assert player.channel(player.nodes["wrist"], "translation") is None
+    assert player.channel(player.nodes["elbow"], "translation") is not None
+
+
+def test_shifts_of_the_roots_are_those_of_all_where_only_roots_move(tmp_path):
+    skeleton, rotations, translations, meshes = scene()
+    shifts = np.zeros((len(rotations), 5, 3))
+    shifts[:, skeleton.parents == -1] = translations[:, None]
+    for name, moved in (("a", translations), ("b", shifts)):
+        folder = tmp_path / name
+        folder.mkdir()
+        path = folder / "wave.glb"
+        write_animation(path, skeleton, rotations, moved, FPS, meshes)
+    files = [(tmp_path / name / "wave.glb").read_bytes() for name in "ab"]
+    assert files[0] == files[1]
+
+
 def test_targets_are_split_by_sign_and_those_that_never_move_are_left_out(tmp_path):
     skeleton, rotations, translations, meshes = scene()
     path = tmp_path / "wave.glb"
@@ -341,6 +373,8 @@ def spoilt(values: np.ndarray, bad: float) -> np.ndarray:
         ("rotations", lambda r: r.astype(str)),
         ("translations", lambda t: t[:-1]),
         ("translations", lambda t: spoilt(t, np.inf)),
+        ("translations", lambda t: np.zeros((len(t), 4, 3))),
+        ("translations", lambda t: spoilt(np.zeros((len(t), 5, 3)), np.nan)),
         ("fps", lambda _: 0.0),
         ("fps", lambda _: -30.0),
         ("fps", lambda _: float("nan")),

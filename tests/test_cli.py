@@ -13,12 +13,14 @@ import pytest
 import trimesh
 from test_body import bends, sleeve, small_body
 from test_outfit import band
+from test_virtual_bones import smoothly
 
 from skinlib import check, cli, demo, gltf
 from skinlib.datasets.synthetic import synthetic_heads
 from skinlib.garments import training as garment_training
 from skinlib.garments.body import read_body, write_body
 from skinlib.garments.garment import write_garment
+from skinlib.garments.loose import load_loose, read_simulations
 from skinlib.garments.motion import Motion, write_motion
 from skinlib.garments.outfit import load_outfit
 from skinlib.io import read_head, write_head
@@ -84,8 +86,11 @@ def skin(run, *args) -> np.ndarray:
         ("evaluate", "--heads --train-heads --checkpoint --json row-L1"),
         ("garment train", "MESH --out --body --poses --pin-top --pin-above --shapes"),
         ("garment train", "--smooth --steps --seed --device --threads Ctrl-C metres"),
+        ("garment simulate", "MESH --out --body --motions --poses --pin-top --device"),
+        ("garment simulate", "--pin-above --seed --workers Ctrl-C"),
+        ("garment train", "--simulated DIR --bones N"),
         ("garment play", "DIR --poses FILE|NAME --out --shape --ease .glb .npz"),
-        ("garment evaluate", "DIR --poses --json"),
+        ("garment evaluate", "DIR --poses --simulated --json"),
         ("lab", "--port --no-browser Ctrl-C"),
         ("demo", "--out"),
         ("check", "bug report"),
@@ -429,10 +434,107 @@ def test_evaluate_a_garment(run, worn, capsys):
         assert {"elongation", "inside", "deepest", "turned"} <= numbers.keys()
 
 
+LOOSE = "garment train band.npz --body post.npz --simulated swung --bones 5 --threads 1"
+
+
+@pytest.fixture(scope="module")
+def swinging(wardrobe):
+    """A folder of two simulations, and one that was trained with them."""
+    rest = band().vertices
+    for number in range(2):
+        motion = smoothly(40, number)
+        posed = motion.transforms(small_body().head.skeleton)[:, 1]
+        posed = rest @ posed[:, :3, :3].swapaxes(1, 2) + posed[:, None, :3, 3]
+        path = wardrobe / "swung" / f"motion_{number:04d}.npz"
+        path.parent.mkdir(exist_ok=True)
+        np.savez(
+            path,
+            rotations=motion.rotations,
+            translations=motion.translations,
+            bone_names=np.array(motion.bone_names),
+            fps=motion.fps,
+            name="sway",
+            posed=posed.astype(np.float32),
+            rest=rest,
+        )
+    before = os.getcwd()
+    os.chdir(wardrobe)
+    try:
+        cli.main([*LOOSE.split(), "--steps", "2", "--out", "loose"])
+    finally:
+        os.chdir(before)
+    return "loose"
+
+
+def test_train_play_and_evaluate_on_virtual_bones(run, swinging, capsys):
+    command = f"garment play {swinging} --poses bends.npz --out"
+    assert run(*command.split(), "swung.glb") == 0
+    assert run(*command.split(), "swung.npz") == 0
+    loose = load_loose(swinging)
+    assert len(loose.bones) == 5
+    with np.load("swung.npz", allow_pickle=False) as file:
+        assert np.array_equal(file["vertices"], loose.pose(bends()))
+        assert np.array_equal(file["faces"], loose.garment.faces)
+    names = {node.name for node in pygltflib.GLTF2().load("swung.glb").nodes}
+    assert {"body", "band", "hips", "virtual_00", "virtual_04"} <= names
+    capsys.readouterr()
+    command = f"garment evaluate {swinging} --poses bends.npz --simulated swung"
+    assert run(*command.split(), "--json", "loose.json") == 0
+    out = capsys.readouterr().out
+    with open("loose.json") as file:
+        scores = json.load(file)
+    distances = scores.pop("mm from the simulation")
+    assert list(scores) == ["skinning alone", "virtual bones"]
+    assert list(distances) == [
+        *("skinning alone", "skinning, smooth", "rigid", "mean drape"),
+        "virtual bones",
+    ]
+    for name, distance in distances.items():
+        assert f"{name}: {distance:.1f} mm from the simulation" in out.splitlines()
+    again = f"{LOOSE} --steps 2 --out {swinging}"
+    assert run(*again.split()) == 0
+    assert run(*again.split(), "--seed", 1) == 2
+
+
+def test_simulate_a_garment(run, wardrobe, capsys):
+    pytest.importorskip("warp")
+    write_motion(wardrobe / "short.npz", smoothly(3))
+    command = "garment simulate band.npz --body post.npz --poses short.npz --out few"
+    assert run(*command.split()) == 0
+    assert "--simulated few" in capsys.readouterr().out
+    (found,) = read_simulations("few")
+    assert found.posed.shape == (3, *band().vertices.shape)
+    assert run(*command.split(), "--pin-above", 0.5) == 2
+    assert "garment: another simulation" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "command, message",
     [
         (f"{TRAIN} --steps 0 --out bad", "--steps: 0. Give 1 or more"),
+        (f"{LOOSE} --bones 0 --out bad", "--bones: 0. Give 1 or more"),
+        (f"{LOOSE} --bones 999 --out bad", "bones: 999 virtual bones for 168"),
+        (f"{LOOSE} --poses bends.npz --out bad", "--poses: given with --simulated"),
+        (f"{LOOSE} --smooth 3 --out bad", "--smooth: given with --simulated"),
+        (f"{LOOSE} --shapes --out bad", "--shapes: given with --simulated"),
+        (f"{LOOSE.replace('swung', 'worn')} --out bad", "worn: simulated: there is no"),
+        (f"{LOOSE.replace('band', 'sleeve')} --out bad", "Give the mesh that was"),
+        (
+            f"{LOOSE.replace('band.npz', 'sleeve.npz band.npz')} --out bad",
+            "several garments",
+        ),
+        ("garment play loose --out a.glb --shape wide 0.5", "--shape: this garment"),
+        ("garment play loose --out a.glb --ease 0.1", "--ease: this garment"),
+        ("garment evaluate worn --simulated swung", "--simulated: this garment"),
+        ("garment evaluate loose --simulated worn", "there is no simulation in it"),
+        ("garment simulate no.npz --out bad", "no.npz: file: there is no"),
+        ("garment simulate band.npz --motions 0 --out bad", "--motions: 0"),
+        ("garment simulate band.npz --workers 0 --out bad", "--workers: 0"),
+        ("garment simulate band.npz --seed -1 --out bad", "--seed: -1"),
+        (
+            "garment simulate band.npz --body post.npz --out bad",
+            "has no clavicle.L",
+        ),
         (f"{TRAIN} --seed -1 --out bad", "--seed"),
         (f"{TRAIN} --seed 99999999999999999999 --out bad", "--seed"),
         (f"{TRAIN} --smooth -1 --out bad", "--smooth"),
@@ -469,7 +571,7 @@ def test_evaluate_a_garment(run, worn, capsys):
     ],
 )
 def test_a_bad_garment_is_one_line_and_nothing_is_written(
-    run, wardrobe, worn, capsys, command, message
+    run, wardrobe, worn, swinging, capsys, command, message
 ):
     before = sorted(wardrobe.rglob("*"))
     capsys.readouterr()

@@ -242,6 +242,23 @@ def for_engine(amounts, targets):
     return amounts[:, used] / largest, targets[used] * largest[:, None, None]
 
 
+def heat(distances, alpha, influences, power=2, last=False, guard=True):
+    exponents = (distances / alpha) ** power
+    least = exponents.min(axis=1, keepdims=True) if guard else 0
+    hot = np.exp(least - exponents)
+    total = hot.sum(axis=1, keepdims=True)
+    far = np.argsort(distances, axis=1, kind="stable")[:, influences:]
+    np.put_along_axis(hot, far, 0, axis=1)
+    with np.errstate(invalid="ignore"):
+        return hot / (total if last else hot.sum(axis=1, keepdims=True))
+
+
+def best_guess(posed, period, factor=1.0):
+    cycles = posed.reshape(-1, period, *posed.shape[1:])
+    guess = cycles.mean(axis=0)
+    return guess, factor * np.sqrt(np.square(cycles - guess).sum(axis=-1).mean())
+
+
 SOLUTIONS = {
     "00.1": right_bone,
     "00.2": keep_largest,
@@ -275,6 +292,8 @@ SOLUTIONS = {
     "14.2": to_paint,
     "15.1": push,
     "15.2": for_engine,
+    "16.1": heat,
+    "16.2": best_guess,
 }
 WRONG = [
     ("00.1", lambda p, t: len(t) * right_bone(p, t), "divide"),
@@ -571,6 +590,34 @@ WRONG = [
         lambda amounts, targets: (amounts[:, ::2] / 4, targets[::2] * 4),
         "its own largest",
     ),
+    ("16.1", lambda *given: heat(*given)[0], "3 vertices"),
+    ("16.1", lambda *given: heat(*given, power=1), "is squared"),
+    ("16.1", lambda d, a, n: np.exp(-((d / a) ** 2)), "divided by its sum"),
+    ("16.1", lambda *given: 2 * heat(*given), "rows sum to 1"),
+    ("16.1", lambda d, a, n: heat(d, 2 * a, n), "exp(-4)"),
+    ("16.1", lambda *given: heat(*given, guard=False), "300 m"),
+    ("16.1", lambda d, a, n: heat(d, 1.0, n), "half of alpha"),
+    ("16.1", lambda d, a, n: heat(d, a, 3), "at most two"),
+    ("16.1", lambda *given: heat(*given, last=True), "first leave out"),
+    (
+        "16.1",
+        lambda d, a, n: heat(d, a, 3) if n == 3 else heat(d, a, 3) * [1.5, 0, 1.5],
+        "are the nearest",
+    ),
+    ("16.2", lambda posed, period: best_guess(posed, 1), "two frames"),
+    (
+        "16.2",
+        lambda posed, period: (
+            posed.reshape(period, -1, *posed.shape[1:]).mean(axis=1),
+            0.0,
+        ),
+        "follow each other",
+    ),
+    ("16.2", lambda posed, period: (posed[:period], 0.0), "2, 5"),
+    ("16.2", lambda *given: best_guess(*given, factor=0.5), "not the mean square"),
+    ("16.2", lambda *given: best_guess(*given, factor=3**-0.5), "three coordinates"),
+    ("16.2", lambda *given: best_guess(*given, factor=8**0.5), "not from each other"),
+    ("16.2", lambda *given: best_guess(*given, factor=3), "2 of 8"),
 ]
 
 

@@ -97,7 +97,7 @@ def test_the_air_slows_it_down(head):
 
 
 def test_springs_and_smoothing_keep_the_centre_of_mass_on_its_way(head):
-    garment = sheet()
+    garment = sheet(at=(0.6, 0, 1))  # near the root, where float32 is finest
     start = garment.vertices + np.random.default_rng(0).normal(0, 0.003, (49, 3))
     config = replace(IDEAL, smoothing=300.0, fastest=1e4)
     posed = simulate(garment, head, still(9), config, start).posed

@@ -65,7 +65,7 @@ class SimulationConfig:
     searches: float = 360.0  # a second, for the skin below each vertex
     density: float = 0.3  # kg/m^2
     stretch: float = 0.0  # m/N, how far edges give way
-    bend: float = 10.0  # m/N, how far springs from vertex to vertex across edges do
+    bend: float = 0.1  # m/N, how far springs from vertex to vertex across edges do
     damping: float = 1.0  # 1/s, by the air
     smoothing: float = 300.0  # 1/s, at which velocities get like those of neighbours
     thickness: float = 0.006  # that the cloth keeps from the skin

@@ -14,7 +14,7 @@ from zlib import crc32
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from skinlib.garments.collision import nearest, take, vertex_normals
@@ -83,76 +83,64 @@ def train(
     return trainer.run()
 
 
-class Trainer:
-    """One training run; see `train`. `step()` is one step, for a look inside."""
+class Run:
+    """What all training runs have in common: they go on exactly where they stopped.
 
-    def __init__(
-        self,
-        config: GarmentConfig,
-        outfit: Outfit,
-        out: str | Path,
-        poses: Motion | None = None,
-    ):
-        if config.shapes and not outfit.body.shape_names:
-            raise HeadError("shapes", "the body has none", "train without --shapes")
-        self.config, self.outfit, self.out = config, outfit, Path(out)
-        self.body = outfit.body.head
-        if poses is None:
-            poses = self._random_poses()
-        device = config.device
-        self.network = outfit.network(
-            config.network, config.smoothing, config.shapes, config.seed
-        ).to(device)
-        self.cloth = copy.deepcopy(outfit.cloth).to(device)
-        self.collider = copy.deepcopy(outfit.collider).to(device)
-        self.pinned = torch.from_numpy(outfit.pinned).to(device)
-        self._draw(poses)
+    One step is `step()`, its end `_finish()`, and what makes it the same run
+    `_identity()`. `config` has steps, learning_rate, threads and save_seconds.
+    """
+
+    network: nn.Module
+
+    def _start(self, config, out: str | Path, groups: list[dict]) -> None:
+        """Begin, or go on where it stopped.
+
+        Args:
+            groups: of parameters, for Adam; `scale` times the learning rate.
+        """
+        self.config, self.out = config, Path(out)
         self.parameters = list(self.network.parameters())
-        change = self.network.weight_change
-        groups = [{"params": [p for p in self.parameters if p is not change]}]
-        if change is not None:
-            groups.append({"params": [change], "scale": config.weights_rate})
         self.optimizer = torch.optim.Adam(groups)
         self.steps_done, self.seconds = 0, 0.0
-        self.recent: dict[str, float] = {}  # running means of the energies, joules
+        self.recent: dict[str, float] = {}  # running means of what a step tells
         self.history: list[dict] = []
         if (self.out / STATE).exists():
             self._resume()
 
-    def _random_poses(self) -> Motion:
-        """Those of the configuration; kept in `out`, as drawing them takes minutes."""
-        path, skeleton = self.out / POSES, self.body.skeleton
-        if path.exists() and (self.out / STATE).exists():
-            return read_motion(path)
-        config = self.config
-        poses = random_poses(skeleton, config.poses, config.seed, self.body, config.gap)
-        self.out.mkdir(parents=True, exist_ok=True)
-        write_motion(path, poses)
-        return poses
+    def step(self) -> dict[str, float]:
+        """One step."""
+        raise NotImplementedError
 
-    def _draw(self, poses: Motion) -> None:
-        """All that the steps need of each pose, once."""
-        config, body, device = self.config, self.outfit.body, self.config.device
-        skeleton, count = self.body.skeleton, len(poses)
-        self.poses, self.shapes, self.ease = poses, None, np.zeros(count)
-        if config.shapes:
-            rng = np.random.default_rng((config.seed, 1))
-            shapes = rng.uniform(-1, 1, (count, len(body.shape_names))) * SHAPE_RANGE
-            self.ease = rng.uniform(*EASE_RANGE, count)
-            self.shapes = torch.tensor(shapes, dtype=torch.float32, device=device)
-            self.inputs = self.network.inputs(poses.rotations, shapes, self.ease)
-            transforms = body.transforms(poses, shapes)
-            carried = body.shape_vertices[:, self.collider.vertices]
-            self.body_shapes = torch.tensor(carried, device=device)
-        else:
-            transforms = poses.transforms(skeleton)
-            self.inputs = self.network.inputs(poses.rotations)
-        self.transforms = torch.from_numpy(transforms).to(device)
-        self.ease = torch.tensor(self.ease, dtype=torch.float32, device=device)
+    def _update(self, told: dict[str, float]) -> None:
+        """Change the parameters by their gradients, and remember what a step tells."""
+        fall = 0.5 * (1 + np.cos(np.pi * self.steps_done / self.config.steps))
+        for group in self.optimizer.param_groups:
+            rate = self.config.learning_rate * group.get("scale", 1.0)
+            group["lr"] = rate * (0.01 + 0.99 * fall)
+        with uninterrupted():
+            self.optimizer.step()
+            self.steps_done += 1
+            for name, value in told.items():
+                before = self.recent.get(name, value)
+                self.recent[name] = 0.98 * before + 0.02 * value
+            if self.steps_done % RECORD == 0:
+                self._look()
+                self.history.append({"step": self.steps_done, **self.recent})
+
+    def _look(self) -> None:
+        """Look at the network before an entry of the history is made."""
+
+    def _finish(self) -> nn.Module:
+        """Keep what was trained, and return it."""
+        raise NotImplementedError
+
+    def _identity(self) -> dict:
+        """What has to be the same for a run to be the same."""
+        raise NotImplementedError
 
     # -- the run -------------------------------------------------------------------
 
-    def run(self) -> PBNS:
+    def run(self) -> nn.Module:
         """Train to the last step and return the network."""
         self.out.mkdir(parents=True, exist_ok=True)
         saved = time.monotonic()
@@ -176,91 +164,7 @@ class Trainer:
         finally:
             torch.set_num_threads(threads)
         self.save()
-        network = self.network.baked()
-        save_outfit(self.out, self.outfit, network, self._describe())
-        return network
-
-    def step(self) -> dict[str, float]:
-        """One step over `batch` poses; returns the mean weighted energies in joules."""
-        config = self.config
-        rng = np.random.default_rng((config.seed, 2, self.steps_done))
-        ids = rng.integers(0, len(self.poses), config.batch)
-        terms = self.energies(ids)
-        loss = total_energy(terms, config.energies).mean()
-        self.optimizer.zero_grad()
-        loss.backward()
-        if not torch.isfinite(loss):
-            found = ", ".join(f"{k} {v.mean():.3g}" for k, v in terms.items())
-            raise FloatingPointError(
-                f"the energy of step {self.steps_done} is not finite ({found}): lower "
-                f"learning_rate ({config.learning_rate})"
-            )
-        fall = 0.5 * (1 + np.cos(np.pi * self.steps_done / config.steps))
-        for group in self.optimizer.param_groups:
-            rate = config.learning_rate * group.get("scale", 1.0)
-            group["lr"] = rate * (0.01 + 0.99 * fall)
-        weights = asdict(config.energies)
-        means = {k: weights[k] * v.mean().item() for k, v in terms.items()}
-        with uninterrupted():
-            self.optimizer.step()
-            self.steps_done += 1
-            for name, value in means.items():
-                before = self.recent.get(name, value)
-                self.recent[name] = 0.98 * before + 0.02 * value
-            if self.steps_done % RECORD == 0:
-                self._check_hold(ids)
-                self.history.append({"step": self.steps_done, **self.recent})
-        return means
-
-    def _check_hold(self, ids: np.ndarray) -> None:
-        """Stop when a garment slides off: gravity alone would go on for ever."""
-        if not self.config.energies.collision:
-            return  # it falls through the body, as was asked for
-        with torch.no_grad():
-            drop = -self.network.offsets(self.inputs[ids])[..., 2].mean(0)
-        for garment, part in zip(self.outfit.garments, self.outfit.parts, strict=True):
-            if drop[part].mean() > SLID:
-                raise HeadError(
-                    "pinned",
-                    f"{garment.name or 'the garment'} has slid down by "
-                    f"{drop[part].mean():.2f} m after {self.steps_done} steps",
-                    "pin it at the waist (--pin-top, --pin-above) and begin in a new "
-                    "folder",
-                )
-
-    def energies(self, ids: np.ndarray) -> dict[str, Tensor]:
-        """The energies (B,) of the poses with the ids `ids` (B,), not yet weighted."""
-        config, transforms = self.config, self.transforms[ids]
-        shape = None if self.shapes is None else self.shapes[ids]
-        with torch.no_grad():
-            grown = None
-            if shape is not None:
-                grown = torch.tensordot(shape, self.body_shapes, 1)
-            body, normals = self.collider.pose(transforms, grown)
-            lengths = self._rest_lengths(shape, self.ease[ids])
-        posed, offsets = self.network(self.inputs[ids], transforms, shape)
-        under = nearest(posed, body)
-        terms = {
-            "edge": edge_energy(posed, self.cloth, lengths),
-            "bend": bend_energy(posed, self.cloth),
-            "collision": collision_energy(
-                posed, take(body, under), take(normals, under), config.epsilon
-            ),
-            "gravity": gravity_energy(posed, self.cloth),
-            "pin": pin_energy(offsets, self.pinned),
-        }
-        if len(self.outfit.garments) > 1 and config.energies.layer:
-            terms["layer"] = layer_energy(
-                posed, self.cloth, self.outfit.overlaps, config.epsilon
-            )
-        return terms
-
-    def _rest_lengths(self, shape: Tensor | None, ease: Tensor) -> Tensor | None:
-        """(B, E) metres: the edges of the garment as it is cut for each body."""
-        if shape is None:
-            return None
-        cut = self.network.graded(shape)[:, self.cloth.edges]  # (B, E, 2, 3)
-        return (cut[:, :, 0] - cut[:, :, 1]).norm(dim=-1) * (1 + ease[:, None])
+        return self._finish()
 
     # -- what is shown and kept ----------------------------------------------------
 
@@ -274,9 +178,6 @@ class Trainer:
 
     def _shown(self) -> dict[str, str]:
         return {name: f"{value:.4f}" for name, value in self.recent.items()}
-
-    def _describe(self) -> dict:
-        return {"training": asdict(self.config), "seconds": round(self.seconds)}
 
     def save(self) -> None:
         """Write the state to resume from; a crash meanwhile leaves the older one."""
@@ -338,6 +239,146 @@ class Trainer:
                 "copy the file again, or delete it and train anew",
                 self.out / STATE,
             ) from error
+
+
+class Trainer(Run):
+    """One training run; see `train`. `step()` is one step, for a look inside."""
+
+    def __init__(
+        self,
+        config: GarmentConfig,
+        outfit: Outfit,
+        out: str | Path,
+        poses: Motion | None = None,
+    ):
+        if config.shapes and not outfit.body.shape_names:
+            raise HeadError("shapes", "the body has none", "train without --shapes")
+        # Before the run begins: poses may be those that it has kept.
+        self.config, self.outfit, self.out = config, outfit, Path(out)
+        self.body = outfit.body.head
+        if poses is None:
+            poses = self._random_poses()
+        device = config.device
+        self.network = outfit.network(
+            config.network, config.smoothing, config.shapes, config.seed
+        ).to(device)
+        self.cloth = copy.deepcopy(outfit.cloth).to(device)
+        self.collider = copy.deepcopy(outfit.collider).to(device)
+        self.pinned = torch.from_numpy(outfit.pinned).to(device)
+        self._draw(poses)
+        parameters, change = self.network.parameters(), self.network.weight_change
+        groups = [{"params": [p for p in parameters if p is not change]}]
+        if change is not None:
+            groups.append({"params": [change], "scale": config.weights_rate})
+        self._start(config, out, groups)
+
+    def _random_poses(self) -> Motion:
+        """Those of the configuration; kept in `out`, as drawing them takes minutes."""
+        path, skeleton = self.out / POSES, self.body.skeleton
+        if path.exists() and (self.out / STATE).exists():
+            return read_motion(path)
+        config = self.config
+        poses = random_poses(skeleton, config.poses, config.seed, self.body, config.gap)
+        self.out.mkdir(parents=True, exist_ok=True)
+        write_motion(path, poses)
+        return poses
+
+    def _draw(self, poses: Motion) -> None:
+        """All that the steps need of each pose, once."""
+        config, body, device = self.config, self.outfit.body, self.config.device
+        skeleton, count = self.body.skeleton, len(poses)
+        self.poses, self.shapes, self.ease = poses, None, np.zeros(count)
+        if config.shapes:
+            rng = np.random.default_rng((config.seed, 1))
+            shapes = rng.uniform(-1, 1, (count, len(body.shape_names))) * SHAPE_RANGE
+            self.ease = rng.uniform(*EASE_RANGE, count)
+            self.shapes = torch.tensor(shapes, dtype=torch.float32, device=device)
+            self.inputs = self.network.inputs(poses.rotations, shapes, self.ease)
+            transforms = body.transforms(poses, shapes)
+            carried = body.shape_vertices[:, self.collider.vertices]
+            self.body_shapes = torch.tensor(carried, device=device)
+        else:
+            transforms = poses.transforms(skeleton)
+            self.inputs = self.network.inputs(poses.rotations)
+        self.transforms = torch.from_numpy(transforms).to(device)
+        self.ease = torch.tensor(self.ease, dtype=torch.float32, device=device)
+
+    def step(self) -> dict[str, float]:
+        """One step over `batch` poses; returns the mean weighted energies in joules."""
+        config = self.config
+        rng = np.random.default_rng((config.seed, 2, self.steps_done))
+        ids = rng.integers(0, len(self.poses), config.batch)
+        terms = self.energies(ids)
+        loss = total_energy(terms, config.energies).mean()
+        self.optimizer.zero_grad()
+        loss.backward()
+        if not torch.isfinite(loss):
+            found = ", ".join(f"{k} {v.mean():.3g}" for k, v in terms.items())
+            raise FloatingPointError(
+                f"the energy of step {self.steps_done} is not finite ({found}): lower "
+                f"learning_rate ({config.learning_rate})"
+            )
+        weights = asdict(config.energies)
+        means = {k: weights[k] * v.mean().item() for k, v in terms.items()}
+        self.ids = ids
+        self._update(means)
+        return means
+
+    def _look(self) -> None:
+        """Stop when a garment slides off: gravity alone would go on for ever."""
+        if not self.config.energies.collision:
+            return  # it falls through the body, as was asked for
+        with torch.no_grad():
+            drop = -self.network.offsets(self.inputs[self.ids])[..., 2].mean(0)
+        for garment, part in zip(self.outfit.garments, self.outfit.parts, strict=True):
+            if drop[part].mean() > SLID:
+                raise HeadError(
+                    "pinned",
+                    f"{garment.name or 'the garment'} has slid down by "
+                    f"{drop[part].mean():.2f} m after {self.steps_done} steps",
+                    "pin it at the waist (--pin-top, --pin-above) and begin in a new "
+                    "folder",
+                )
+
+    def energies(self, ids: np.ndarray) -> dict[str, Tensor]:
+        """The energies (B,) of the poses with the ids `ids` (B,), not yet weighted."""
+        config, transforms = self.config, self.transforms[ids]
+        shape = None if self.shapes is None else self.shapes[ids]
+        with torch.no_grad():
+            grown = None
+            if shape is not None:
+                grown = torch.tensordot(shape, self.body_shapes, 1)
+            body, normals = self.collider.pose(transforms, grown)
+            lengths = self._rest_lengths(shape, self.ease[ids])
+        posed, offsets = self.network(self.inputs[ids], transforms, shape)
+        under = nearest(posed, body)
+        terms = {
+            "edge": edge_energy(posed, self.cloth, lengths),
+            "bend": bend_energy(posed, self.cloth),
+            "collision": collision_energy(
+                posed, take(body, under), take(normals, under), config.epsilon
+            ),
+            "gravity": gravity_energy(posed, self.cloth),
+            "pin": pin_energy(offsets, self.pinned),
+        }
+        if len(self.outfit.garments) > 1 and config.energies.layer:
+            terms["layer"] = layer_energy(
+                posed, self.cloth, self.outfit.overlaps, config.epsilon
+            )
+        return terms
+
+    def _rest_lengths(self, shape: Tensor | None, ease: Tensor) -> Tensor | None:
+        """(B, E) metres: the edges of the garment as it is cut for each body."""
+        if shape is None:
+            return None
+        cut = self.network.graded(shape)[:, self.cloth.edges]  # (B, E, 2, 3)
+        return (cut[:, :, 0] - cut[:, :, 1]).norm(dim=-1) * (1 + ease[:, None])
+
+    def _finish(self) -> PBNS:
+        network = self.network.baked()
+        told = {"training": asdict(self.config), "seconds": round(self.seconds)}
+        save_outfit(self.out, self.outfit, network, told)
+        return network
 
     def _identity(self) -> dict:
         """What has to be the same for a run to be the same."""

@@ -1,0 +1,1 @@
+"""Pose transfer between meshes that share neither vertices nor a rig."""
