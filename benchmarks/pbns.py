@@ -127,19 +127,17 @@ def main(
             "frame_ms": frame_ms(outfit, network),
         }
         for test, motion in tests.items():
-            result[test] = {
-                "skinning alone": asdict(
-                    measure(outfit, motion, skinned(outfit, motion))
-                ),
-                "PBNS": asdict(measure(outfit, motion, outfit.pose(network, motion))),
-            }
+            result[test] = judged(outfit, network, motion)
+        for shape in SHAPES if config.shapes else ():
+            label = ", ".join(f"{key} {value:+g}" for key, value in shape.items())
+            result[label] = judged(outfit, network, tests["motions"], shape)
         path = out / f"{name}.json"
         path.write_text(json.dumps(result, indent=1) + "\n")
         print(f"{name}: {result['minutes']:.1f} minutes, {result['frame_ms']:.2f} ms")
-        for test in result.keys() - {"minutes", "frame_ms"}:
+        for test in list(result)[2:]:
             for method, values in result[test].items():
                 numbers = "  ".join(f"{k} {v:.3f}" for k, v in values.items())
-                print(f"  {test:8s} {method:15s} {numbers}")
+                print(f"  {test:12s} {method:15s} {numbers}")
 
 
 def every_third(motion: Motion) -> Motion:

@@ -33,6 +33,7 @@ from skinlib.garments.motion import Motion
 from skinlib.garments.outfit import load_outfit
 from skinlib.garments.simulation import Simulated
 from skinlib.garments.virtual_bones import VirtualBonesConfig, heat_weights
+from skinlib.geometry import mesh_edges
 from skinlib.head import HeadError
 from skinlib.skinning import linear_blend_skinning
 from skinlib.training.checkpoint import read_tensors, write_tensors
@@ -272,6 +273,18 @@ def test_errors_by_hand(trained, simulated):
     shifted.append(Simulated(few, garment.pose(few), garment.rest))
     # 24 frames are 5 mm off and 8 frames are right.
     assert errors(garment, shifted, False)[KIND] == pytest.approx(5 * 0.75**0.5, 1e-3)
+
+
+def test_errors_of_edges_keep_the_cloth_whole(simulated, tmp_path):
+    torn = {}
+    for weight in (0.0, 30.0):
+        config = replace(CONFIG, steps=200, learning_rate=1e-2, edges=weight)
+        folder = tmp_path / str(weight)
+        garment = train(config, BODY, CLOTH, simulated, folder)
+        off = garment.pose(simulated[1].motion) - simulated[1].posed
+        a, b = mesh_edges(CLOTH.faces).T
+        torn[weight] = np.square(off[:, a] - off[:, b]).mean()
+    assert torn[30.0] < 0.95 * torn[0.0]
 
 
 def test_an_error_of_nan_stops_before_it_does_harm(simulated, tmp_path):

@@ -129,6 +129,14 @@ def test_the_same_person_in_the_same_pose_comes_back(body, poses):
     np.testing.assert_allclose(result, points, atol=1e-4)
 
 
+def test_a_body_on_its_head_is_found_as_well(body, poses):
+    """Each bone starts from the turn of its own vertices, so no turn is too large."""
+    over = Rotation.from_rotvec([3.0, 0.5, 0.0]).as_matrix()
+    points = posed(body.head, poses, 2) @ over.T
+    fit = fit_pose(body, points, iterations=12)
+    assert fit.error < 1e-5
+
+
 def test_noise_averages_out(body, poses):
     points = posed(body.head, poses, 3)
     side = np.ptp(points, axis=0).max()

@@ -21,7 +21,6 @@ Levenberg and Marquardt, from a Procrustes rotation of each bone (Kabsch 1976).
 Symbols: V vertices of the body, J bones, K shapes, P points of a cloud.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -110,7 +109,8 @@ def fit_cloud(
     the pose is fitted to the matches, in turn, while what holds the joints in place
     gives way. It ends in the nearest hollow: poses far from where it starts are not
     found. Known poses, such as those that a network was trained on, give it more places
-    to start from.
+    to start from. A body of a few hundred vertices is enough and takes a second or two,
+    one of 12,000 minutes.
 
     Args:
         body, scaled, shaped: as for `fit_pose`.
@@ -506,7 +506,7 @@ class _Model:
         )
 
 
-def _shaped_skeleton(body: Body, amounts: Sequence[float]) -> Skeleton:
+def _shaped_skeleton(body: Body, amounts: np.ndarray) -> Skeleton:
     skeleton = body.head.skeleton
     joints = skeleton.joints.astype(np.float64)
     if len(amounts):
