@@ -55,8 +55,10 @@ from skinlib.garments.virtual_bones import (
     oracle,
     place_bones,
 )
+from skinlib.head import Head, Skeleton
 from skinlib.paths import sample
 from skinlib.skinning import linear_blend_skinning
+from skinlib.training import load_model
 
 UNSEEN, UNSEEN_SEED = 8, 1_000_000
 BONES, INFLUENCES = (8, 16, 24, 40, 80, 160), (1, 2, 4, 8)
@@ -311,12 +313,45 @@ def sweep(bench: Benchmark) -> dict:
     return {"trained": rows}
 
 
+def weights(bench: Benchmark) -> dict:
+    """Other ways to share the cloth among the same bones, and what they give at best.
+
+    The network of Part I has learnt heads; here it skins a skirt, its virtual bones
+    given as joints without parents and tails.
+    """
+    posed = np.concatenate(
+        [bench.seen_by_root(item)[::10] for item in bench.sets["unseen"]]
+    )
+    rest, faces = bench.sets["unseen"][0].rest, bench.garment.faces
+    standard = bench.config
+    ids = place_bones(rest, faces, standard.bones, standard.seed)
+    along = bone_distances(rest, faces, ids)
+    straight = np.linalg.norm(rest[:, None] - rest[ids], axis=-1)
+    names = [f"virtual_{i}" for i in range(len(ids))]
+    skeleton = Skeleton.from_heads_and_tails(rest[ids], None, [-1] * len(ids), names)
+    skirt = Head.create(rest, faces, skeleton)
+    spacing, most = bone_spacing(along, ids), standard.influences
+    ways = {
+        "heat along the cloth": fading_heat(along, spacing, most),
+        "heat through the air": fading_heat(straight, spacing, most),
+        "the nearest bone alone": np.eye(len(ids))[along.argmin(axis=1)],
+        "the network of Part I": load_model("heads").predict(skirt),
+    }
+    found = {}
+    for way, shares in ways.items():
+        transforms = oracle(rest, shares, posed, "rigid")
+        fitted = linear_blend_skinning(rest, shares, transforms)
+        found[f"{way}, mm"] = 1000 * rms(fitted, posed)
+    return found
+
+
 PARTS: dict[str, Callable[[Benchmark], dict]] = {
     "simulator": simulator,
     "accuracy": accuracy,
     "stream": stream,
     "speed": speed,
     "curves": curves,
+    "weights": weights,
     "sweep": sweep,
 }
 

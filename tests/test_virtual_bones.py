@@ -274,17 +274,18 @@ def test_bind_and_offset_undo_each_other(rig):
 
 
 def test_looseness_by_hand():
+    by = {"threshold": 0.01, "slope": 1 / 0.03}  # loose altogether from 40 mm on
     lbs = np.zeros((10, 4, 3))
     simulated = np.zeros((10, 4, 3))
     simulated[:, 0, 0] = 0.008
     simulated[:, 1] = [0.015, 0.02, 0]  # 25 mm
     simulated[:, 2, 1] = -0.05
     simulated[9, 3, 2] = 0.2  # 20 mm in the mean
-    found = looseness(lbs, simulated)
+    found = looseness(lbs, simulated, **by)
     assert found == pytest.approx([0, 0.5, 1, 1 / 3]) and found.dtype == np.float32
-    assert looseness(lbs, simulated, reduce="p90")[3] == pytest.approx(1 / 3)
+    assert looseness(lbs, simulated, reduce="p90", **by)[3] == pytest.approx(1 / 3)
     simulated[7:, 3, 2] = 0.035
-    assert looseness(lbs, simulated, reduce="p90")[3] == pytest.approx(5 / 6)
+    assert looseness(lbs, simulated, reduce="p90", **by)[3] == pytest.approx(5 / 6)
     assert not looseness(lbs, lbs).any()
 
 

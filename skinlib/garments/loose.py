@@ -31,6 +31,8 @@ from skinlib.garments.training import Run
 from skinlib.garments.virtual_bones import (
     KERNELS,
     LEAST_TOTAL,
+    SLOPE,
+    THRESHOLD,
     VirtualBonesConfig,
     VirtualBonesNet,
     bone_distances,
@@ -126,8 +128,8 @@ class LooseConfig:
     alpha: float | None = None  # metres that heat reaches; None: as bones are apart
     kernel: str = KERNELS[0]
     hybrid: bool = True  # joints move what is tight; else virtual bones move all
-    threshold: float = 0.003  # metres off, from where a vertex is loose
-    slope: float = 100.0  # per metre: 1 cm further and it is loose altogether
+    threshold: float = THRESHOLD  # metres off, from where a vertex is loose
+    slope: float = SLOPE  # per metre: from there to loose altogether
     reduce: str = "mean"  # over the frames, or "p90"
     least: float = LEAST_TOTAL  # vertices that a joint moves, or it is left out
     steps: int = 800
@@ -391,7 +393,7 @@ def bind(
 def fading_heat(
     distances: np.ndarray, alpha: float, influences: int = 8, kernel: str = KERNELS[0]
 ) -> np.ndarray:
-    """(V, N) float32 like `heat_weights`, but without a step from vertex to vertex.
+    """(V, N) float32 like `heat_weights`, but without a step. Equation `fading_heat`.
 
     Of the hottest bones that count, each loses the heat of the hottest one that does
     not: so a bone has faded out where another takes its place. Else the cloth is torn

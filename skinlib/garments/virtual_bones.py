@@ -40,8 +40,8 @@ KERNELS = ("gauss", "exponential")
 REDUCTIONS = ("mean", "p90")
 ORACLES = ("affine", "rigid", "translation")
 
-THRESHOLD = 0.01  # metres: LBS this far from the truth is good enough
-SLOPE = 1 / 0.03  # per metre: 3 cm further and a vertex is loose altogether
+THRESHOLD = 0.003  # metres: LBS this far from the truth is good enough
+SLOPE = 100.0  # per metre: 1 cm further and a vertex is loose altogether
 LEAST_TOTAL = 0.5  # vertices: a joint that moves less of a garment is left out
 LEAST_SPREAD = 1e-3  # of a feature: one that hardly varies is noise, not blown up
 GRAVITY = np.array([0.0, 0, -1])
