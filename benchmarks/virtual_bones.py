@@ -258,6 +258,22 @@ def speed(bench: Benchmark, frames: int = 300) -> dict:
     }
 
 
+def times(bench: Benchmark, frames: int = 300) -> dict:
+    """Milliseconds a frame of a stream, by virtual bones and influences."""
+    motion = bench.sets["minute"][0].motion
+    transforms = motion.transforms(bench.body.head.skeleton)[:frames]
+    pairs = {(bones, bench.config.influences) for bones in BONES}
+    pairs |= {(bench.config.bones, influences) for influences in INFLUENCES}
+    rows = []
+    for bones, influences in sorted(pairs):
+        config = replace(bench.config, bones=bones, influences=influences)
+        garment = bound(config, bench.body, bench.garment, motion)
+        steps = garment.stream(transforms, motion.fps)
+        next(steps)
+        rows.append({"bones": bones, "influences": influences, "ms": per_frame(steps)})
+    return {"stream": rows}
+
+
 def bound(
     config: LooseConfig, body: Body, garment: Garment, motion: Motion
 ) -> LooseGarment:
@@ -350,6 +366,7 @@ PARTS: dict[str, Callable[[Benchmark], dict]] = {
     "accuracy": accuracy,
     "stream": stream,
     "speed": speed,
+    "times": times,
     "curves": curves,
     "weights": weights,
     "sweep": sweep,
