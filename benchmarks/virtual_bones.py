@@ -361,6 +361,17 @@ def weights(bench: Benchmark) -> dict:
     return found
 
 
+def seeds(bench: Benchmark) -> dict:
+    """Is the hybrid better than virtual bones alone, or was it luck?"""
+    found = {}
+    for seed in (1, 2):
+        for name in ("hybrid", "virtual bones alone"):
+            garment = bench.trained(f"{name} {seed}", **VARIANTS[name], seed=seed)
+            error = errors(garment, bench.sets["unseen"], baselines=False)[KIND]
+            found[f"{name}, seed {seed}, mm"] = error
+    return found
+
+
 PARTS: dict[str, Callable[[Benchmark], dict]] = {
     "simulator": simulator,
     "accuracy": accuracy,
@@ -370,6 +381,7 @@ PARTS: dict[str, Callable[[Benchmark], dict]] = {
     "curves": curves,
     "weights": weights,
     "sweep": sweep,
+    "seeds": seeds,
 }
 
 

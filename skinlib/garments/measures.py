@@ -2,7 +2,7 @@
 
 Share and depth inside are measured with the true distance to the posed body, which
 training never sees: there the nearest vertex has to do. Elongation, bend and collision
-are named as in GAPS (Chen et al., WACV 2024).
+are named as in GAPS (WACV 2024).
 """
 
 from collections.abc import Mapping, Sequence

@@ -268,8 +268,7 @@ and lifts the toes. Abduction lifts a limb sideways and bends the trunk to the l
 Twist turns a limb's front inwards, and the trunk to the left. In the A-pose the arms
 hang 48 degrees below the horizontal and the elbows are bent by 42: abduction of 48
 lifts an arm to the horizontal, and elbow flexion of -35 nearly straightens it. The
-ranges were chosen by eye on the shipped body, within what healthy adults can do
-(compare Norkin and White, Measurement of Joint Motion).
+ranges were chosen by eye on the shipped body.
 """
 
 LIMITS: dict[str, np.ndarray] = {
