@@ -697,28 +697,28 @@ def simulate_motions(
     config, out = config or SimulationConfig(), Path(out)
     paths = [out / f"motion_{number:04d}.npz" for number in range(len(motions))]
     _begin(out, garment, head, config)
-    todo = []
+    missing = []
     for motion, path in zip(motions, paths, strict=True):
         motion.transforms(head.skeleton)  # rather now than after an hour
         if path.exists():
             _check_same(motion, path)
         else:
-            todo.append((motion, path))
-    bar = tqdm(total=len(motions), initial=len(motions) - len(todo), unit="motion")
+            missing.append((motion, path))
+    bar = tqdm(total=len(motions), initial=len(motions) - len(missing), unit="motion")
     with bar:
-        if not todo:
+        if not missing:
             return paths
         simulator = Simulator(garment, head, config, device)
         rest = simulator.settled()
         if workers < 2:
-            for motion, path in todo:
+            for motion, path in missing:
                 _write(path, motion, simulator, rest)
                 bar.update()
             return paths
         # A forked process could not use CUDA.
         with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
             job = garment, head, config, device, rest
-            pending = [pool.submit(_simulate_to, *job, *pair) for pair in todo]
+            pending = [pool.submit(_simulate_to, *job, *pair) for pair in missing]
             try:
                 for done in as_completed(pending):
                     done.result()

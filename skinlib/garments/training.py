@@ -7,6 +7,7 @@ interrupted ends in the same bits as one that was not, if the threads are as man
 import copy
 import json
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -83,7 +84,7 @@ def train(
     return trainer.run()
 
 
-class Run:
+class Run(ABC):
     """What all training runs have in common: they go on exactly where they stopped.
 
     One step is `step()`, its end `_finish()`, and what makes it the same run
@@ -107,9 +108,9 @@ class Run:
         if (self.out / STATE).exists():
             self._resume()
 
+    @abstractmethod
     def step(self) -> dict[str, float]:
         """One step."""
-        raise NotImplementedError
 
     def _update(self, told: dict[str, float]) -> None:
         """Change the parameters by their gradients, and remember what a step tells."""
@@ -127,16 +128,16 @@ class Run:
                 self._look()
                 self.history.append({"step": self.steps_done, **self.recent})
 
-    def _look(self) -> None:
+    def _look(self) -> None:  # noqa: B027  # most runs have nothing to look at
         """Look at the network before an entry of the history is made."""
 
+    @abstractmethod
     def _finish(self) -> nn.Module:
         """Keep what was trained, and return it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _identity(self) -> dict:
         """What has to be the same for a run to be the same."""
-        raise NotImplementedError
 
     # -- the run -------------------------------------------------------------------
 
