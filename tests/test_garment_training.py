@@ -278,7 +278,7 @@ def test_energies_fall(layers, tmp_path):
 
 
 def test_steps_tell_weighted_means_and_remember_them(outfit, tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "RECORD", 2)
+    monkeypatch.setattr("skinlib.training.run.RECORD", 2)
     config = replace(CONFIG, steps=5, energies=EnergyWeights(bend=1e-4, gravity=0.5))
     trainer = Trainer(config, outfit, tmp_path, bends())
     ids = np.random.default_rng((0, 2, 0)).integers(0, 12, 4)
@@ -357,7 +357,7 @@ def test_a_rate_that_is_too_high_is_told(layers, tmp_path):
 
 @pytest.mark.parametrize(("drop", "falls"), [(0.2, True), (0.1, False)])
 def test_a_garment_that_slides_off_is_told(layers, tmp_path, monkeypatch, drop, falls):
-    monkeypatch.setattr(training, "RECORD", 1)
+    monkeypatch.setattr("skinlib.training.run.RECORD", 1)
     trainer = Trainer(CONFIG, layers, tmp_path / "run", bends())
     with torch.no_grad():
         trainer.network.embed[-2].weight.zero_()

@@ -27,7 +27,6 @@ from skinlib.garments.garment import Garment, read_garment, write_garment
 from skinlib.garments.motion import Motion, training_motions, walk
 from skinlib.garments.outfit import BODY, CLOTH_COLOURS, FRAMES, SKIN_COLOUR
 from skinlib.garments.simulation import Simulated, read_simulated, root_frame
-from skinlib.garments.training import Run
 from skinlib.garments.virtual_bones import (
     KERNELS,
     LEAST_TOTAL,
@@ -59,6 +58,7 @@ from skinlib.training.checkpoint import (
     replace_file,
     write_tensors,
 )
+from skinlib.training.run import Run
 
 GARMENT = "garment.npz"
 KIND = "virtual bones"

@@ -6,8 +6,6 @@ interrupted ends in the same bits as one that was not, if the threads are as man
 
 import copy
 import json
-import time
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -15,8 +13,7 @@ from zlib import crc32
 
 import numpy as np
 import torch
-from torch import Tensor, nn
-from tqdm.auto import tqdm
+from torch import Tensor
 
 from skinlib.garments.collision import nearest, take, vertex_normals
 from skinlib.garments.energies import (
@@ -33,12 +30,10 @@ from skinlib.garments.motion import Motion, random_poses, read_motion, write_mot
 from skinlib.garments.outfit import Outfit, save_outfit
 from skinlib.garments.pbns import PBNS, PBNSConfig
 from skinlib.head import HeadError
-from skinlib.training.checkpoint import STATE, read_tensors, replace_file, write_tensors
-from skinlib.training.trainer import uninterrupted
+from skinlib.training.checkpoint import STATE
+from skinlib.training.run import Run
 
 POSES = "poses.npz"
-HISTORY = "history.json"
-RECORD = 100  # steps from one entry of the history to the next
 SLID = 0.15  # metres that a garment may hang lower than it was drafted
 SHAPE_RANGE, EASE_RANGE = 0.6, (-0.05, 0.1)
 
@@ -82,164 +77,6 @@ def train(
     """
     trainer = Trainer(config, outfit, out, poses)
     return trainer.run()
-
-
-class Run(ABC):
-    """What all training runs have in common: they go on exactly where they stopped.
-
-    One step is `step()`, its end `_finish()`, and what makes it the same run
-    `_identity()`. `config` has steps, learning_rate, threads and save_seconds.
-    """
-
-    network: nn.Module
-
-    def _start(self, config, out: str | Path, groups: list[dict]) -> None:
-        """Begin, or go on where it stopped.
-
-        Args:
-            groups: of parameters, for Adam; `scale` times the learning rate.
-        """
-        self.config, self.out = config, Path(out)
-        self.parameters = list(self.network.parameters())
-        self.optimizer = torch.optim.Adam(groups)
-        self.steps_done, self.seconds = 0, 0.0
-        self.recent: dict[str, float] = {}  # running means of what a step tells
-        self.history: list[dict] = []
-        if (self.out / STATE).exists():
-            self._resume()
-
-    @abstractmethod
-    def step(self) -> dict[str, float]:
-        """One step."""
-
-    def _update(self, told: dict[str, float]) -> None:
-        """Change the parameters by their gradients, and remember what a step tells."""
-        fall = 0.5 * (1 + np.cos(np.pi * self.steps_done / self.config.steps))
-        for group in self.optimizer.param_groups:
-            rate = self.config.learning_rate * group.get("scale", 1.0)
-            group["lr"] = rate * (0.01 + 0.99 * fall)
-        with uninterrupted():
-            self.optimizer.step()
-            self.steps_done += 1
-            for name, value in told.items():
-                before = self.recent.get(name, value)
-                self.recent[name] = 0.98 * before + 0.02 * value
-            if self.steps_done % RECORD == 0:
-                self._look()
-                self.history.append({"step": self.steps_done, **self.recent})
-
-    def _look(self) -> None:  # noqa: B027  # most runs have nothing to look at
-        """Look at the network before an entry of the history is made."""
-
-    @abstractmethod
-    def _finish(self) -> nn.Module:
-        """Keep what was trained, and return it."""
-
-    @abstractmethod
-    def _identity(self) -> dict:
-        """What has to be the same for a run to be the same."""
-
-    # -- the run -------------------------------------------------------------------
-
-    def run(self) -> nn.Module:
-        """Train to the last step and return the network."""
-        self.out.mkdir(parents=True, exist_ok=True)
-        saved = time.monotonic()
-        threads = torch.get_num_threads()
-        torch.set_num_threads(self.config.threads)
-        try:
-            with self._bar() as bar:
-                while self.steps_done < self.config.steps:
-                    began = time.monotonic()
-                    self.step()
-                    self.seconds += time.monotonic() - began
-                    bar.update()
-                    bar.set_postfix(self._shown(), refresh=False)
-                    if time.monotonic() - saved > self.config.save_seconds:
-                        self.save()
-                        saved = time.monotonic()
-        except KeyboardInterrupt:
-            self.save()
-            tqdm.write(f"Stopped; the same call goes on from {self.out / STATE}.")
-            raise
-        finally:
-            torch.set_num_threads(threads)
-        self.save()
-        return self._finish()
-
-    # -- what is shown and kept ----------------------------------------------------
-
-    def _bar(self) -> tqdm:
-        return tqdm(
-            total=self.config.steps,
-            initial=self.steps_done,
-            desc="garment",
-            unit="step",
-        )
-
-    def _shown(self) -> dict[str, str]:
-        return {name: f"{value:.4f}" for name, value in self.recent.items()}
-
-    def save(self) -> None:
-        """Write the state to resume from; a crash meanwhile leaves the older one."""
-        tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
-        for i, parameter in enumerate(self.parameters):
-            for key, value in self.optimizer.state.get(parameter, {}).items():
-                tensors[f"optimizer.{i}.{key}"] = value
-        progress = {
-            "run": self._identity(),
-            "steps_done": self.steps_done,
-            "seconds": self.seconds,
-            "recent": self.recent,
-            "history": self.history,
-        }
-        tensors = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-        write_tensors(self.out / STATE, tensors, {"progress": json.dumps(progress)})
-        replace_file(self.out / HISTORY, json.dumps(self.history, indent=1).encode())
-
-    def _resume(self) -> None:
-        tensors, metadata = read_tensors(self.out / STATE)
-        try:
-            progress = json.loads(metadata["progress"])
-            run, mine = progress["run"], self._identity()
-            differs = [key for key in mine if run.get(key) != mine[key]]
-            if differs:
-                raise HeadError(
-                    ", ".join(differs),
-                    "another run, with other settings or meshes, was begun here",
-                    "continue it with the arguments it was begun with, or choose a new "
-                    "folder for this one",
-                    self.out,
-                )
-            self.network.load_state_dict(
-                {
-                    key.removeprefix("network."): value
-                    for key, value in tensors.items()
-                    if key.startswith("network.")
-                }
-            )
-            for i, parameter in enumerate(self.parameters):
-                prefix = f"optimizer.{i}."
-                state = {
-                    key.removeprefix(prefix): value.to(
-                        "cpu" if key.endswith("step") else parameter.device
-                    )
-                    for key, value in tensors.items()
-                    if key.startswith(prefix)
-                }
-                if state:
-                    self.optimizer.state[parameter].update(state)
-            self.steps_done, self.seconds = progress["steps_done"], progress["seconds"]
-            self.recent, self.history = progress["recent"], progress["history"]
-        except HeadError:
-            raise
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise HeadError(
-                "checkpoint",
-                f"a file that is no state of a run ({type(error).__name__})",
-                "copy the file again, or delete it and train anew",
-                self.out / STATE,
-            ) from error
 
 
 class Trainer(Run):
