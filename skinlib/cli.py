@@ -658,6 +658,147 @@ def garment_evaluate(
             file.write(f"{json.dumps(numbers, indent=1)}\n".encode())
 
 
+def pose_train(
+    *,
+    out: Folder,
+    people: Annotated[str, arg(metavar="shipped|anny|DIR")] = "shipped",
+    vertices: Annotated[tuple[int, ...], arg(metavar="N ...")] = (1229,),
+    identities: Annotated[int, arg(metavar="I")] = 16,
+    poses: Annotated[int, arg(metavar="T")] = 400,
+    network: Annotated[str, arg(metavar="NAME")] = "dsffnet",
+    width: Annotated[int, arg(metavar="C")] = 1024,
+    steps: Annotated[int, arg(metavar="N")] = 51_200,
+    rate: Annotated[float, arg(metavar="R")] = 1e-3,
+    noise: Annotated[float, arg(metavar="A")] = 0.0,
+    seed: Annotated[int, arg(metavar="S")] = 0,
+    device: Annotated[str, arg(metavar="D")] = "cpu",
+    threads: Annotated[int, arg(metavar="T")] = min(2, os.cpu_count() or 1),
+) -> None:
+    """Learn to give one mesh the pose of another, without any bones.
+
+    Who takes part is drawn from the seed: people in random poses, who share neither the
+    order nor the number of their vertices. Ctrl-C stops; the same command goes on where
+    it stopped. At full width it takes a GPU, or days.
+
+    For example:
+      skinlib pose train --out runs/pose --device cuda
+      skinlib pose train --out runs/small --width 256 --vertices 369 --steps 4000
+      skinlib pose train --out runs/faces --people cast --vertices --width 256
+
+    Args:
+        out: Folder that all is written to; made when there is none.
+        people: The shipped body in random shapes, Anny's bodies, or a folder of skinned
+            heads or bodies that share a mesh and bones.
+        vertices: Of each mesh that they are given; without a number, the one they have.
+        identities: People to learn; of a folder three quarters are learnt.
+        poses: How many each of them takes.
+        network: dsffnet, npt or corenet.
+        width: Of the network; 256 has a fifteenth of the parameters.
+        steps: How long to train, 8 pairs a step.
+        rate: The learning rate to begin with.
+        noise: On the sources, as a share of their size, such as 0.01.
+        seed: Same seed, same network.
+        device: Where to compute, such as cpu or cuda.
+        threads: CPU cores to use.
+    """
+    from skinlib.pose_transfer.population import Population
+    from skinlib.pose_transfer.training import TransferConfig, train
+
+    _check_numbers(("--steps", steps, 1), ("--threads", threads, 1))
+    _check_seed(seed)
+    if not 0 < rate < float("inf"):
+        raise HeadError("--rate", f"{rate}", "give more than 0, such as 0.001")
+    population = Population(people, vertices, identities, poses=poses, seed=seed)
+    settings = {"width": width}
+    if network != "corenet":  # the only one without this encoder
+        settings["encoder"] = max(width // 16, 32)
+    config = TransferConfig(
+        network=network,
+        settings=settings,
+        steps=steps,
+        learning_rate=rate,
+        noise=noise,
+        seed=seed,
+        device=_device(device),
+        threads=threads,
+    )
+    casts = population.casts("train", config.device)
+    train(config, casts, out, {"population": population.describe()})
+    print(f"{out}: use it with `skinlib pose transfer SOURCE TARGET OUT --model {out}`")
+
+
+def pose_transfer(
+    source: Annotated[Positional[Path], arg(metavar="SOURCE")],
+    target: Annotated[Positional[Path], arg(metavar="TARGET")],
+    out: Annotated[Positional[Path], arg(metavar="OUT")],
+    *,
+    model: Checkpoint = "poses",
+) -> None:
+    """Give the mesh TARGET the pose of the mesh SOURCE.
+
+    Neither needs bones or weights, and they need not share a mesh. Both are bodies,
+    unless --model has learnt something else; they stand upright and face -Y, as people
+    do in Blender. OUT has the triangles, texture coordinates and size of TARGET.
+
+    For example:
+      skinlib pose transfer dancer.glb me.obj me_dancing.obj
+      skinlib pose transfer smile.glb other.glb smiling.glb --model runs/faces
+
+    Args:
+        source: Mesh whose pose is taken: .glb, .gltf, .obj, .ply or .stl.
+        target: Mesh that takes it.
+        out: Where the posed mesh goes: .glb, .obj, .ply or .stl.
+        model: A shipped network, or a folder that `skinlib pose train` wrote.
+    """
+    from skinlib.pose_transfer.training import load_network
+    from skinlib.pose_transfer.transfer import check_mesh_target, transfer_file
+
+    check_mesh_target(out)
+    transfer_file(load_network(model)[0], source, target, out)
+    print(f"{out}: {target.name} in the pose of {source.name}")
+
+
+def pose_evaluate(
+    folder: Annotated[Positional[str], arg(metavar="DIR")],
+    *,
+    pairs: Annotated[int, arg(metavar="N")] = 200,
+    json_file: Annotated[Path | None, arg(name="json", metavar="FILE")] = None,
+) -> None:
+    """Judge a trained pose transfer on people whom it has never seen.
+
+    In poses that it has learnt with others, and in poses that it has not, beside a copy
+    of the target as it stands.
+
+    Args:
+        folder: What `skinlib pose train` wrote, or a shipped network.
+        pairs: How many of each to judge by.
+        json_file: Write the numbers to this file, too.
+    """
+    from dataclasses import asdict
+
+    from skinlib.io import atomic
+    from skinlib.pose_transfer.population import Population, judging
+    from skinlib.pose_transfer.training import load_network
+    from skinlib.pose_transfer.transfer import judge
+
+    _check_json(json_file)
+    _check_numbers(("--pairs", pairs, 1))
+    network, told = load_network(folder)
+    population = Population.read(told, folder)
+    seen, unseen = judging(population, pairs)
+    results = {
+        "poses it has learnt": judge(network, seen),
+        "poses it has not": judge(network, unseen),
+        "the same, target copied": judge(None, unseen),
+    }
+    for name, result in results.items():
+        print(f"{name}: {result.line()}")
+    if json_file:
+        numbers = {name: asdict(result) for name, result in results.items()}
+        with atomic(json_file) as file:
+            file.write(f"{json.dumps(numbers, indent=1)}\n".encode())
+
+
 def demo(*, out: Folder = Path("demo")) -> None:
     """Skin the sample head, print the scores, write a .glb and a picture.
 
@@ -700,12 +841,17 @@ def garment() -> None:
     """Learn how clothes move with a body: simulate, train, play, evaluate."""
 
 
+def pose() -> None:
+    """Give one mesh the pose of another, without bones: train, transfer, evaluate."""
+
+
 COMMANDS = {
     "skin": skin,
     "train": train,
     "evaluate": evaluate,
     "bench": bench,
     "garment": garment,
+    "pose": pose,
     "lab": lab,
     "demo": demo,
     "check": check,
@@ -717,6 +863,11 @@ GROUPS = {
         "train": garment_train,
         "play": garment_play,
         "evaluate": garment_evaluate,
+    },
+    "pose": {
+        "train": pose_train,
+        "transfer": pose_transfer,
+        "evaluate": pose_evaluate,
     },
 }
 
