@@ -27,6 +27,8 @@ from skinlib.io import read_head, write_head
 from skinlib.model import ModelConfig, SkinningModel
 from skinlib.painting import limit_influences, prune, smooth_weights, symmetrize
 from skinlib.paths import sample
+from skinlib.pose_transfer.data import drawn_bodies
+from skinlib.pose_transfer.training import make_network, save_network
 from skinlib.training import TrainConfig, load_model, save_model
 
 SMALL = ModelConfig(mesh_width=8, bone_width=8, blocks=1, points=2, tree_layers=1)
@@ -91,6 +93,10 @@ def skin(run, *args) -> np.ndarray:
         ("garment train", "--simulated DIR --bones N"),
         ("garment play", "DIR --poses FILE|NAME --out --shape --ease .glb .npz"),
         ("garment evaluate", "DIR --poses --simulated --json"),
+        ("pose train", "--out --people --vertices --identities --poses --network"),
+        ("pose train", "--width --steps --rate --noise --seed --device --threads"),
+        ("pose transfer", "SOURCE TARGET OUT --model .glb .obj"),
+        ("pose evaluate", "DIR --pairs --json"),
         ("lab", "--port --no-browser Ctrl-C"),
         ("demo", "--out"),
         ("check", "bug report"),
@@ -323,6 +329,75 @@ def test_evaluate_writes_the_table_and_the_numbers(run, capsys):
         assert scores["heads"].keys() == {"head_0", "head_1", "head_2"}
         for row in [scores["mean"], *scores["heads"].values()]:
             assert expected <= row.keys()
+
+
+# --------------------------------------------------------------------------------- pose
+
+POSE = "pose train --people posts --vertices --poses 4 --width 32 --threads 1"
+
+
+@pytest.fixture(scope="module")
+def posts(place):
+    """A folder of four bodies on one mesh in `place`, and two meshes to pose."""
+    (place / "posts").mkdir()
+    for number, head in enumerate(drawn_bodies(small_body(), 4)):
+        write_head(place / "posts" / f"{number}.npz", head)
+    ball = trimesh.creation.icosphere(2)
+    ball.export(place / "ball.obj")
+    ball.apply_scale([1, 2, 3])
+    ball.export(place / "egg.ply")
+    return place
+
+
+def test_train_a_pose_transfer_judge_it_and_use_it(run, posts, capsys):
+    assert run(*POSE.split(), "--steps", "3", "--out", "posed") == 0
+    assert "skinlib pose transfer SOURCE TARGET OUT" in capsys.readouterr().out
+    assert run(*"pose evaluate posed --pairs 3 --json posed.json".split()) == 0
+    told = capsys.readouterr().out
+    assert told.count("PMD") == 3 and "poses it has not" in told
+    numbers = json.loads((posts / "posed.json").read_text())
+    assert 0 < numbers["the same, target copied"]["pmd"] < 1
+    command = "pose transfer egg.ply ball.obj new.glb --model posed"
+    assert run(*command.split()) == 0
+    new = trimesh.load_mesh(posts / "new.glb", process=False)
+    ball = trimesh.load_mesh(posts / "ball.obj", process=False)
+    np.testing.assert_array_equal(new.faces, ball.faces)
+
+
+def test_options_of_pose_train_reach_the_training(run, posts):
+    options = "--network npt --rate 0.01 --noise 0.02 --seed 3 --identities 2"
+    assert run(*POSE.split(), *options.split(), "--steps", "1", "--out", "npt") == 0
+    config = json.loads((posts / "npt" / "config.json").read_text())
+    training, population = config["training"], config["population"]
+    assert config["pose transfer"] == "npt" and config["settings"]["width"] == 32
+    assert training["learning_rate"] == 0.01 and training["noise"] == 0.02
+    assert training["seed"] == population["seed"] == 3
+    assert population["identities"] == 2 and population["vertices"] == []
+
+
+@pytest.mark.parametrize(
+    "command, words",
+    [
+        ("pose train --out x --steps 0", "--steps: 0"),
+        ("pose train --out x --rate 0", "--rate: 0.0"),
+        ("pose train --out x --people nobody", "nobody: folder: there is no such"),
+        ("pose train --out x --network gan", "network: there is no 'gan'"),
+        ("pose train --out x --width 3", "width: it is 3"),
+        ("pose train --out x --identities 0", "identities: 0"),
+        ("pose train --out x --vertices 2", "vertices: 2"),
+        ("pose transfer egg.ply ball.obj o.fbx", "o.fbx: OUT: the name ends in"),
+        ("pose transfer egg.ply ball.obj o.obj --model posts", "there is no such file"),
+        ("pose transfer no.ply ball.obj o.obj --model small", "no.ply: file: there is"),
+        ("pose evaluate posts", "model.safetensors: model: there is no such file"),
+        ("pose evaluate small", "small: population: there is none"),
+    ],
+)
+def test_bad_input_of_pose(run, posts, capsys, command, words):
+    save_network(posts / "small", make_network("dsffnet", {"width": 32}, 0), {})
+    assert run(*command.split()) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("skinlib: ") and error.count("\n") == 1 and words in error
+    assert not (posts / "o.obj").exists() and not (posts / "x").exists()
 
 
 # ------------------------------------------------------------------------------ garment

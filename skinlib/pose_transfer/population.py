@@ -6,7 +6,7 @@ SMPL's, which may not be shipped.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
 from typing import Literal
@@ -17,6 +17,7 @@ import torch
 from skinlib.datasets.folder import load_folder
 from skinlib.datasets.remesh import halve
 from skinlib.garments.body import read_body
+from skinlib.garments.measures import joined
 from skinlib.garments.motion import JOINTS, Motion, Range, bend, random_poses
 from skinlib.head import Head, HeadError, Skeleton
 from skinlib.pose_transfer.data import (
@@ -80,8 +81,6 @@ class Population:
                 raise HeadError(name, f"{getattr(self, name)}", f"give {least} or more")
         if self.seed < 0:
             raise HeadError("seed", f"{self.seed}", "give 0 or more")
-        if self.limits not in ("npt", "wide"):
-            raise HeadError("limits", f"{self.limits!r}", "use npt or wide")
         for count in self.vertices:
             if count < 4:
                 raise HeadError("vertices", f"{count}", "give 4 or more")
@@ -117,19 +116,15 @@ class Population:
         Poses 0 to `poses` - 1 are those of the training; casts that judge have as many
         others after them.
         """
+        # Somebody who is the same for both parts: so are the axes of his joints, and
+        # the meshes made of him.
+        first = self.heads("train")[0]
         heads = self.heads(part)
-        skeleton = heads[0].skeleton
-        motions = _motion(skeleton, self.poses, self.limits, self.seed)
+        motion = self._motion(first.skeleton, self.seed)
         if part == "judge":
-            unseen = _motion(skeleton, self.poses, self.limits, self.seed + OTHERS)
-            motions = replace(
-                motions,
-                rotations=np.concatenate([motions.rotations, unseen.rotations]),
-                translations=np.concatenate(
-                    [motions.translations, unseen.translations]
-                ),
-            )
-        return [Cast(group, motions, device) for group in self._on_meshes(heads)]
+            unseen = self._motion(first.skeleton, self.seed + OTHERS)
+            motion = joined([motion, unseen])
+        return [Cast(group, motion, device) for group in self._on_meshes(heads, first)]
 
     def heads(self, part: Literal["train", "judge"]) -> list[Head]:
         """The identities at rest, on the mesh that they come with."""
@@ -146,22 +141,27 @@ class Population:
             return heads
         return [h for i, h in enumerate(heads) if (i % KEPT_BACK != 3) == train][:count]
 
-    def _on_meshes(self, heads: Sequence[Head]) -> list[Sequence[Head]]:
+    def _motion(self, skeleton: Skeleton, seed: int) -> Motion:
+        moved = {bone for joint in JOINTS.values() for bone in joint.bones}
+        draw = npt_poses if self.limits == "npt" else random_poses
+        if not moved <= set(skeleton.names):
+            draw = expressions
+        return draw(skeleton, self.poses, seed)
+
+    def _on_meshes(self, heads: Sequence[Head], first: Head) -> list[Sequence[Head]]:
         if not self.vertices:
             return [heads]
-        # Somebody who is the same for both parts: so are the meshes made of him.
-        train = self.heads("train")[0]
         groups = []
         for number, count in enumerate(self.vertices):
-            keep = count / len(train.vertices)
+            keep = count / len(first.vertices)
             if keep > 1:
                 raise HeadError(
                     "vertices",
-                    f"{count} for people who have {len(train.vertices)}",
+                    f"{count} for people who have {len(first.vertices)}",
                     "give fewer, or none for the mesh they have",
                 )
-            mesh = halve(train, (self.seed, number), keep)
-            groups.append(on_mesh(heads, train, mesh))
+            mesh = halve(first, np.random.default_rng((self.seed, number)), keep)
+            groups.append(on_mesh(heads, first, mesh))
         return groups
 
 
@@ -234,14 +234,6 @@ def npt_poses(skeleton: Skeleton, count: int, seed: int) -> Motion:
         angles = rng.uniform(low, high).T
         poses.append(bend(skeleton, dict(zip(JOINTS, angles, strict=True))))
     return Motion.create(np.stack(poses), skeleton.names, name="poses as NPT's")
-
-
-def _motion(skeleton: Skeleton, count: int, limits: str, seed: int) -> Motion:
-    moved = {bone for joint in JOINTS.values() for bone in joint.bones}
-    if not moved <= set(skeleton.names):
-        return expressions(skeleton, count, seed)
-    draw = npt_poses if limits == "npt" else random_poses
-    return draw(skeleton, count, seed)
 
 
 def _check_alike(heads: Sequence[Head], folder: Path) -> None:

@@ -44,8 +44,8 @@ class TransferConfig:
     settings: dict = field(default_factory=dict)  # of it, where not the default
     steps: int = 51_200  # the source: 200 epochs of 256
     batch: int = 8  # pairs a step
-    learning_rate: float = 1e-3
-    falls: int = 25  # times in the run, each to 0.8; the source: every 8 epochs
+    learning_rate: float = 1e-3  # falls to 1 % along a cosine
+    falls: int = 0  # or so often, each time to 0.8; the source: 25, every 8 epochs
     edge_weight: float = EDGE_WEIGHT  # lambda
     noise: float = 0.0  # on the sources, as a share of their size
     seed: int = 0  # of parameters and pairs
@@ -123,7 +123,8 @@ class TransferTrainer(Run):
         self._start(config, out, groups, torch.optim.AdamW)
 
     def _fallen(self, done: float) -> float:
-        return FALL ** int(done * self.config.falls)
+        falls = self.config.falls
+        return FALL ** int(done * falls) if falls else super()._fallen(done)
 
     def step(self) -> dict[str, float]:
         """One step over `batch` pairs, of one pair of meshes; returns loss and PMD."""

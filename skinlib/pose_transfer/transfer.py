@@ -65,7 +65,7 @@ def _same(a: np.ndarray, b: np.ndarray) -> bool:
     if len(a) != len(b):
         return False
     there, back = cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
-    return max(there.max(), back.max()) < SAME
+    return bool(max(there.max(), back.max()) < SAME)
 
 
 # --- files ----------------------------------------------------------------------------
