@@ -668,7 +668,7 @@ def pose_train(
     network: Annotated[str, arg(metavar="NAME")] = "dsffnet",
     width: Annotated[int, arg(metavar="C")] = 1024,
     steps: Annotated[int, arg(metavar="N")] = 51_200,
-    rate: Annotated[float, arg(metavar="R")] = 1e-3,
+    rate: Annotated[float, arg(metavar="R")] = 2e-3,
     noise: Annotated[float, arg(metavar="A")] = 0.0,
     seed: Annotated[int, arg(metavar="S")] = 0,
     device: Annotated[str, arg(metavar="D")] = "cpu",
@@ -695,7 +695,7 @@ def pose_train(
         network: dsffnet, npt or corenet.
         width: Of the network; 256 has a fifteenth of the parameters.
         steps: How long to train, 8 pairs a step.
-        rate: The learning rate to begin with.
+        rate: The highest learning rate.
         noise: On the sources, as a share of their size, such as 0.01.
         seed: Same seed, same network.
         device: Where to compute, such as cpu or cuda.

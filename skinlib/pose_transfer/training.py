@@ -29,6 +29,7 @@ from skinlib.training.checkpoint import (
 )
 from skinlib.training.run import Run
 
+WARM_UP = 0.1  # of a run, in which the learning rate rises
 FALL = 0.8  # what is left of the learning rate each time that it falls
 
 
@@ -44,8 +45,8 @@ class TransferConfig:
     settings: dict = field(default_factory=dict)  # of it, where not the default
     steps: int = 51_200  # the source: 200 epochs of 256
     batch: int = 8  # pairs a step
-    learning_rate: float = 1e-3  # falls to 1 % along a cosine
-    falls: int = 0  # or so often, each time to 0.8; the source: 25, every 8 epochs
+    learning_rate: float = 2e-3  # rises for a tenth of the run, then falls to 1 %
+    falls: int = 0  # or it falls so often, to 0.8; the source: 25, every 8 epochs
     edge_weight: float = EDGE_WEIGHT  # lambda
     noise: float = 0.0  # on the sources, as a share of their size
     seed: int = 0  # of parameters and pairs
@@ -123,8 +124,10 @@ class TransferTrainer(Run):
         self._start(config, out, groups, torch.optim.AdamW)
 
     def _fallen(self, done: float) -> float:
-        falls = self.config.falls
-        return FALL ** int(done * falls) if falls else super()._fallen(done)
+        if self.config.falls:
+            return FALL ** int(done * self.config.falls)
+        risen = min(1, (done + 1 / self.config.steps) / WARM_UP)
+        return risen * super()._fallen(done)
 
     def step(self) -> dict[str, float]:
         """One step over `batch` pairs, of one pair of meshes; returns loss and PMD."""
