@@ -63,7 +63,7 @@ ABLATIONS = {
     "no edges in the loss": {"edge_weight": 0.0},
 }
 NOISE = (0.01, 0.02, 0.05)
-LONG = 8000  # steps of the narrow network that meshes and noise are tried on
+LONG = 4000  # steps of the narrow network that meshes and noise are tried on
 JUDGED = 400  # pairs
 
 
@@ -171,9 +171,9 @@ def start(bench: Bench) -> dict:
 
 
 def ablations(bench: Bench) -> dict:
-    """The source's table 3, three seeds each, at 400 and at 2,000 steps."""
+    """The source's table 3, three seeds each, at 400 and at 1,200 steps."""
     tests, found = bench.tests(QUICK), {}
-    for steps in (400, 2000):
+    for steps in (400, 1200):
         for label, changes in ABLATIONS.items():
             for seed in SEEDS:
                 run = f"ablations/{label.replace(' ', '_')}_{steps}_{seed}"
@@ -360,7 +360,7 @@ def faces(bench: Bench) -> dict:
     population = Population(str(folder), (500,), limits="wide")
     found = {"copy": bench.judged(None, bench.tests(population))}
     for name in NARROW:
-        settings = narrow(name, steps=2000)
+        settings = narrow(name, steps=1200)
         network = bench.trained(f"faces/{name}", population, **settings)
         found[name] = bench.judged(network, bench.tests(population))
     return found

@@ -8,7 +8,9 @@ towards -Y, the left hand at +X, in an A-pose.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -175,6 +177,56 @@ def write_body(path: str | Path, body: Body) -> None:
         )
 
 
+class AnnyRig(NamedTuple):
+    """Anny's model on one mesh, with the J bones that are kept.
+
+    Attributes:
+        model: the package's own. kept: J ids of its bones.
+        names: J strings. parents: J ids among the kept, -1 for the root.
+        weights: (V, J), those of a bone that is left out added to its parent's.
+    """
+
+    model: object
+    kept: list[int]
+    names: list[str]
+    parents: list[int]
+    weights: np.ndarray
+
+    def skeleton(self, joints: np.ndarray) -> Skeleton:
+        """The kept bones of somebody, from the (B, 3) joints of all."""
+        return Skeleton.from_heads_and_tails(
+            joints[self.kept], None, self.parents, self.names
+        )
+
+
+@lru_cache(maxsize=4)
+def anny_rig(topology: str = "notoes") -> AnnyRig:
+    """The rig of all bodies of Anny's; the first call takes minutes, once.
+
+    Raises:
+        HeadError: the package `anny` is not installed.
+    """
+    try:
+        from anny import Anny
+    except ImportError as error:
+        raise HeadError(
+            "anny body", "the package anny is not installed", "run `pip install anny`"
+        ) from error
+    model = Anny(rig="anny-notoes", topology=topology, skinning_method="lbs")
+    names = model.bone_labels
+    kept = [b for b, name in enumerate(names) if not name.startswith(MERGED)]
+    place = {bone: i for i, bone in enumerate(kept)}
+    parents = [place.get(model.bone_parents[bone], -1) for bone in kept]
+    for bone, parent in enumerate(model.bone_parents):  # parents come first
+        place.setdefault(bone, place.get(parent))
+    columns = np.array([place[bone] for bone in range(len(names))])
+    influences = columns[model.vertex_bone_indices.numpy()]
+    weights = np.zeros((len(influences), len(kept)))
+    rows = np.arange(len(weights))[:, None]
+    np.add.at(weights, (rows, influences), model.vertex_bone_weights.numpy())
+    return AnnyRig(model, kept, [names[bone] for bone in kept], parents, weights)
+
+
 def anny_body() -> Body:
     """Build the shipped body anew: 12,272 vertices, 24,540 triangles, 36 bones.
 
@@ -186,44 +238,23 @@ def anny_body() -> Body:
     """
     import torch
 
-    try:
-        from anny import Anny
-    except ImportError as error:
-        raise HeadError(
-            "anny body", "the package anny is not installed", "run `pip install anny`"
-        ) from error
-    model = Anny(rig="anny-notoes", topology="notoes", skinning_method="lbs")
+    rig = anny_rig()
 
     def rest(**changes) -> tuple[np.ndarray, np.ndarray]:
         with torch.inference_mode():
-            body = model(None, phenotype_kwargs=ADULT | changes)
+            body = rig.model(None, phenotype_kwargs=ADULT | changes)
         return (
             body["rest_vertices"][0].numpy().astype(np.float32),
             body["rest_bone_heads"][0].numpy().astype(np.float32),
         )
 
-    names = model.bone_labels
-    kept = [b for b, name in enumerate(names) if not name.startswith(MERGED)]
-    place = {bone: i for i, bone in enumerate(kept)}
-    parents = np.array([place.get(model.bone_parents[bone], -1) for bone in kept])
-    for bone, parent in enumerate(model.bone_parents):  # parents come first
-        place.setdefault(bone, place.get(parent))
     vertices, joints = rest()
-    weights = np.zeros((len(vertices), len(kept)))
-    columns = np.array([place[bone] for bone in range(len(names))])
-    rows = np.arange(len(weights))[:, None]
-    influences = columns[model.vertex_bone_indices.numpy()]
-    np.add.at(weights, (rows, influences), model.vertex_bone_weights.numpy())
-
     # Half the way from one end of the phenotype to the other: 1 is the end itself.
     ends = [(rest(**{name: 1.0}), rest(**{name: 0.0})) for name in SHAPES]
-    skeleton = Skeleton.from_heads_and_tails(
-        joints[kept], None, parents, [names[bone] for bone in kept]
-    )
-    faces = model.get_triangular_faces().numpy()
+    faces = rig.model.get_triangular_faces().numpy()
     return Body(
-        Head.create(vertices, faces, skeleton, weights=weights, name="body"),
+        Head.create(vertices, faces, rig.skeleton(joints), rig.weights, name="body"),
         SHAPES,
         np.stack([(high[0] - low[0]) / 2 for high, low in ends]),
-        np.stack([(high[1] - low[1])[kept] / 2 for high, low in ends]),
+        np.stack([(high[1] - low[1])[rig.kept] / 2 for high, low in ends]),
     )

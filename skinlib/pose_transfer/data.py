@@ -14,7 +14,6 @@ Symbols: I identities, T poses, B items, M vertices of the source, N of the iden
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -23,10 +22,10 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from skinlib.garments.binding import closest_point_values
-from skinlib.garments.body import MERGED, Body
+from skinlib.garments.body import Body, anny_rig
 from skinlib.garments.motion import Motion
 from skinlib.geometry import mesh_edges
-from skinlib.head import Head, HeadError, Skeleton
+from skinlib.head import Head, HeadError
 from skinlib.skinning import linear_blend_skinning
 
 Array = TypeVar("Array", np.ndarray, Tensor)
@@ -102,7 +101,8 @@ def anny_bodies(
         raise HeadError(
             "topology", f"there is no {topology!r}", f"use {', '.join(TOPOLOGIES)}"
         )
-    model, kept, weights = _anny(topology)
+    rig = anny_rig(topology)
+    model = rig.model
     from anny.shape_distribution import SimpleShapeDistribution
 
     ends = torch.tensor(age, dtype=model.dtype)
@@ -117,43 +117,17 @@ def anny_bodies(
     with torch.inference_mode():
         rest = model(None, phenotype_kwargs=batch)
     vertices, joints = rest["rest_vertices"].numpy(), rest["rest_bone_heads"].numpy()
-    names = [model.bone_labels[bone] for bone in kept]
-    place = {bone: number for number, bone in enumerate(kept)}
-    parents = [place.get(model.bone_parents[bone], -1) for bone in kept]
     faces = model.get_triangular_faces().numpy()
     return [
         Head.create(
             vertices[i],
             faces,
-            Skeleton.from_heads_and_tails(joints[i, kept], None, parents, names),
-            weights=weights,
+            rig.skeleton(joints[i]),
+            weights=rig.weights,
             name=f"anny_{seed + i}",
         )
         for i in range(count)
     ]
-
-
-@lru_cache(maxsize=4)
-def _anny(topology: str) -> tuple[object, list[int], np.ndarray]:
-    """Anny's model, the ids of the bones that are kept, and (V, J) weights on those."""
-    try:
-        from anny import Anny
-    except ImportError as error:
-        raise HeadError(
-            "anny body", "the package anny is not installed", "run `pip install anny`"
-        ) from error
-    model = Anny(rig="anny-notoes", topology=topology, skinning_method="lbs")
-    names = model.bone_labels
-    kept = [b for b, name in enumerate(names) if not name.startswith(MERGED)]
-    place = {bone: number for number, bone in enumerate(kept)}
-    for bone, parent in enumerate(model.bone_parents):  # parents come first
-        place.setdefault(bone, place.get(parent))
-    columns = np.array([place[bone] for bone in range(len(names))])
-    influences = columns[model.vertex_bone_indices.numpy()]
-    weights = np.zeros((len(influences), len(kept)))
-    rows = np.arange(len(weights))[:, None]
-    np.add.at(weights, (rows, influences), model.vertex_bone_weights.numpy())
-    return model, kept, weights
 
 
 def on_mesh(heads: Sequence[Head], reference: Head, mesh: Head) -> list[Head]:
