@@ -148,7 +148,7 @@ def test_a_signal_waits_for_the_end_of_an_update(outfit, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"seed": 1}, "seed: another run, with other settings or meshes"),
+        ({"seed": 1}, "seed: another run, with other settings or data"),
         ({"steps": 7}, "steps: another run"),
         ({"shapes": True}, "shapes: another run"),
         ({"energies": EnergyWeights(bend=1)}, "energies: another run"),

@@ -13,7 +13,8 @@ from skinlib.training.config import (
     TermForms,
     TrainConfig,
 )
-from skinlib.training.trainer import HISTORY, Trainer, train
+from skinlib.training.state import HISTORY
+from skinlib.training.trainer import Trainer, train
 
 __all__ = [
     "AS_WRITTEN",

@@ -1,6 +1,5 @@
 """A training run that goes on exactly where it stopped: what all of Part II share."""
 
-import json
 import time
 from abc import ABC, abstractmethod
 from pathlib import Path
@@ -10,11 +9,9 @@ import torch
 from torch import nn
 from tqdm.auto import tqdm
 
-from skinlib.head import HeadError
-from skinlib.training.checkpoint import STATE, read_tensors, replace_file, write_tensors
-from skinlib.training.trainer import uninterrupted
+from skinlib.training.checkpoint import STATE
+from skinlib.training.state import read_state, uninterrupted, write_state
 
-HISTORY = "history.json"
 RECORD = 100  # steps from one entry of the history to the next
 
 
@@ -128,10 +125,6 @@ class Run(ABC):
 
     def save(self) -> None:
         """Write the state to resume from; a crash meanwhile leaves the older one."""
-        tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
-        for i, parameter in enumerate(self.parameters):
-            for key, value in self.optimizer.state.get(parameter, {}).items():
-                tensors[f"optimizer.{i}.{key}"] = value
         progress = {
             "run": self._identity(),
             "steps_done": self.steps_done,
@@ -139,50 +132,13 @@ class Run(ABC):
             "recent": self.recent,
             "history": self.history,
         }
-        tensors = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-        write_tensors(self.out / STATE, tensors, {"progress": json.dumps(progress)})
-        replace_file(self.out / HISTORY, json.dumps(self.history, indent=1).encode())
+        write_state(self.out, {"network": self.network}, self._memory(), progress)
 
     def _resume(self) -> None:
-        tensors, metadata = read_tensors(self.out / STATE)
-        try:
-            progress = json.loads(metadata["progress"])
-            run, mine = progress["run"], self._identity()
-            differs = [key for key in mine if run.get(key) != mine[key]]
-            if differs:
-                raise HeadError(
-                    ", ".join(differs),
-                    "another run, with other settings or meshes, was begun here",
-                    "continue it with the arguments it was begun with, or choose a new "
-                    "folder for this one",
-                    self.out,
-                )
-            self.network.load_state_dict(
-                {
-                    key.removeprefix("network."): value
-                    for key, value in tensors.items()
-                    if key.startswith("network.")
-                }
-            )
-            for i, parameter in enumerate(self.parameters):
-                prefix = f"optimizer.{i}."
-                state = {
-                    key.removeprefix(prefix): value.to(
-                        "cpu" if key.endswith("step") else parameter.device
-                    )
-                    for key, value in tensors.items()
-                    if key.startswith(prefix)
-                }
-                if state:
-                    self.optimizer.state[parameter].update(state)
-            self.steps_done, self.seconds = progress["steps_done"], progress["seconds"]
-            self.recent, self.history = progress["recent"], progress["history"]
-        except HeadError:
-            raise
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise HeadError(
-                "checkpoint",
-                f"a file that is no state of a run ({type(error).__name__})",
-                "copy the file again, or delete it and train anew",
-                self.out / STATE,
-            ) from error
+        networks = {"network": self.network}
+        progress = read_state(self.out, networks, self._memory(), self._identity())
+        self.steps_done, self.seconds = progress["steps_done"], progress["seconds"]
+        self.recent, self.history = progress["recent"], progress["history"]
+
+    def _memory(self) -> list[tuple[nn.Parameter, dict]]:
+        return [(p, self.optimizer.state[p]) for p in self.parameters]

@@ -7,14 +7,11 @@ one that was not, and the number of threads changes the time, not the result. In
 in minutes the clock decides how many steps there are, and how they cool down.
 """
 
-import contextlib
 import copy
 import json
-import signal
-import threading
 import time
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -35,19 +32,11 @@ from skinlib.model import Critic, SkinningModel
 from skinlib.model.confidence import fit_calibration
 from skinlib.model.inputs import content_hash, mesh_input, skeleton_input
 from skinlib.training import parallel
-from skinlib.training.checkpoint import (
-    STATE,
-    load_model,
-    read_tensors,
-    replace_file,
-    save_model,
-    write_tensors,
-)
+from skinlib.training.checkpoint import STATE, load_model, save_model
 from skinlib.training.config import TrainConfig
 from skinlib.training.propagation import Propagation
+from skinlib.training.state import read_state, uninterrupted, write_state
 from skinlib.training.terms import D_S, D_U, Sample, Terms
-
-HISTORY = "history.json"
 
 
 def train(
@@ -420,15 +409,6 @@ class Trainer:
         """Write the state to resume from; a crash meanwhile leaves the older one."""
         if not parallel.is_first():
             return
-        self.out.mkdir(parents=True, exist_ok=True)
-        tensors = {
-            f"{name}.{key}": value
-            for name, network in {"average": self.average, **self.networks}.items()
-            for key, value in network.state_dict().items()
-        }
-        for i, parameter in enumerate(self.parameters):
-            for key, value in self._moments(parameter).items():
-                tensors[f"optimizer.{i}.{key}"] = value
         progress = {
             "run": self._identity(),
             "steps_done": self.steps_done,
@@ -437,59 +417,21 @@ class Trainer:
             "recent": self.recent,
             "history": self.history,
         }
-        tensors = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-        write_tensors(self.out / STATE, tensors, {"progress": json.dumps(progress)})
-        replace_file(self.out / HISTORY, json.dumps(self.history, indent=1).encode())
+        write_state(self.out, self._all_networks(), self._memory(), progress)
 
     def _resume(self) -> None:
-        tensors, metadata = read_tensors(self.out / STATE)
-        try:
-            self._restore(tensors, json.loads(metadata["progress"]))
-        except HeadError:
-            raise
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise HeadError(
-                "checkpoint",
-                f"a file that is no state of a run ({type(error).__name__})",
-                "copy the file again, or delete it and train anew",
-                self.out / STATE,
-            ) from error
-
-    def _restore(self, tensors: dict[str, Tensor], progress: dict) -> None:
-        if progress["run"] != self._identity():
-            differs = [
-                key
-                for key, value in self._identity().items()
-                if progress["run"].get(key) != value
-            ]
-            raise HeadError(
-                ", ".join(differs),
-                "another run, with other settings or heads, was begun here",
-                "continue it with the arguments it was begun with, or choose a new "
-                "folder for this one",
-                self.out,
-            )
-
-        def part(name):
-            prefix = f"{name}."
-            return {
-                key.removeprefix(prefix): value
-                for key, value in tensors.items()
-                if key.startswith(prefix)
-            }
-
-        for name, network in {"average": self.average, **self.networks}.items():
-            network.load_state_dict(part(name))
-        for i, parameter in enumerate(self.parameters):
-            state = part(f"optimizer.{i}")
-            if state:
-                moments = {k: v.to(parameter.device) for k, v in state.items()}
-                if "step" in state:
-                    moments["step"] = state["step"]
-                self._moments(parameter).update(moments)
+        progress = read_state(
+            self.out, self._all_networks(), self._memory(), self._identity()
+        )
         self.steps_done, self.seconds = progress["steps_done"], progress["seconds"]
         self.best, self.history = progress["best"], progress["history"]
         self.recent = progress["recent"]
+
+    def _all_networks(self) -> dict[str, nn.Module]:
+        return {"average": self.average, **self.networks}
+
+    def _memory(self) -> list[tuple[nn.Parameter, dict]]:
+        return [(parameter, self._moments(parameter)) for parameter in self.parameters]
 
     def _moments(self, parameter: Tensor) -> dict[str, Tensor]:
         """What the optimizer in charge of a parameter remembers of it."""
@@ -588,23 +530,3 @@ def _check_weights(heads: Sequence[Head], fix: str) -> None:
     for head in heads:
         if head.weights is None:
             raise HeadError("weights", f"head {head.name!r} has none", fix)
-
-
-@contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Ctrl-C waits for the end of the block: nobody can go on from half an update."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    waiting: list[int] = []
-    usual = {
-        number: signal.signal(number, lambda number, _: waiting.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield
-    finally:
-        for number, handler in usual.items():
-            signal.signal(number, handler)
-        for number in waiting:
-            signal.raise_signal(number)
