@@ -733,6 +733,7 @@ def pose_transfer(
     out: Annotated[Positional[Path], arg(metavar="OUT")],
     *,
     model: Checkpoint = "poses",
+    reach: Annotated[float, arg(metavar="R")] = 0.07,
 ) -> None:
     """Give the mesh TARGET the pose of the mesh SOURCE.
 
@@ -749,12 +750,16 @@ def pose_transfer(
         target: Mesh that takes it.
         out: Where the posed mesh goes: .glb, .obj, .ply or .stl.
         model: A shipped network, or a folder that `skinlib pose train` wrote.
+        reach: How far the shape of TARGET is kept, as a share of its size; 0 for what
+            the network gives, which is softer.
     """
     from skinlib.pose_transfer.training import load_network
     from skinlib.pose_transfer.transfer import check_mesh_target, transfer_file
 
     check_mesh_target(out)
-    transfer_file(load_network(model)[0], source, target, out)
+    if not 0 <= reach < float("inf"):
+        raise HeadError("--reach", f"{reach}", "give 0 or more, such as 0.07")
+    transfer_file(load_network(model)[0], source, target, out, reach)
     print(f"{out}: {target.name} in the pose of {source.name}")
 
 

@@ -14,6 +14,7 @@ from skinlib.head import HeadError
 from skinlib.io import write_head
 from skinlib.pose_transfer import training
 from skinlib.pose_transfer.data import Cast, PosePairs, drawn_bodies
+from skinlib.pose_transfer.metrics import edge_error
 from skinlib.pose_transfer.networks import NETWORKS, parameter_kb
 from skinlib.pose_transfer.population import (
     NPT_LIMITS,
@@ -361,11 +362,14 @@ def test_the_result_stands_where_the_target_stood_in_its_size():
     assert abs(here[:, 2].min() - MESH.vertices[:, 2].min()) < 1e-6
     middle = (here.min(0) + here.max(0)) / 2
     np.testing.assert_allclose(middle[:2], 0, atol=1e-6)
+    raw = transfer_pose(NETWORK, source, MESH.vertices, EDGES, reach=0)
     lengths = [
         np.linalg.norm(p[EDGES[:, 0]] - p[EDGES[:, 1]], axis=1)
-        for p in (here, MESH.vertices)
+        for p in (raw, MESH.vertices)
     ]
     assert abs((lengths[0] * lengths[1]).sum() / (lengths[0] ** 2).sum() - 1) < 1e-5
+    off = [edge_error(points, MESH.vertices, EDGES) for points in (here, raw)]
+    assert off[0] < 0.9 * off[1]  # an untrained network gives little to keep
 
 
 def test_the_order_of_vertices_does_not_matter():

@@ -16,6 +16,7 @@ from skinlib.head import HeadError
 from skinlib.io import atomic
 from skinlib.pose_transfer.data import PosePairs, normalised, size_by_edges
 from skinlib.pose_transfer.metrics import Scores, mean_scores, score
+from skinlib.pose_transfer.refine import REACH, as_rigid_as_possible
 
 SAME = 1e-5
 """Two meshes are one when each point of either lies closer than this, in the cube from
@@ -24,17 +25,23 @@ SAME = 1e-5
 
 @torch.inference_mode()
 def transfer_pose(
-    network: nn.Module, source: np.ndarray, target: np.ndarray, edges: np.ndarray
+    network: nn.Module,
+    source: np.ndarray,
+    target: np.ndarray,
+    edges: np.ndarray,
+    reach: float = REACH,
 ) -> np.ndarray:
     """(N, 3) float32: the target in the pose of the source, in its own size and order.
 
     A network sees both meshes in the cube from -1 to 1. Its result is scaled so that
     edges are as long as they were, and put where the target stood: on the same floor,
-    in the middle of the same box. A mesh in its own pose stays as it is.
+    in the middle of the same box; its shape is that of the target as far as the pose
+    allows. A mesh in its own pose stays as it is.
 
     Args:
         source: (M, 3), upright and facing as in training: Z up, facing -Y.
         target: (N, 3), so, too. edges: (E, 2) of the target.
+        reach: of `as_rigid_as_possible`; 0 for what the network gives.
 
     Raises:
         HeadError: fewer than two vertices, NaN, all points at one place, no edge with a
@@ -47,6 +54,7 @@ def transfer_pose(
     points = [torch.tensor(p[None], dtype=torch.float32) for p in (boxed, mine)]
     posed = network(*(p.to(device) for p in points))[0].cpu().numpy()
     posed = posed * size_by_edges(posed, target, edges)
+    posed = as_rigid_as_possible(posed, target, edges, reach)
     low, high = posed.min(0), posed.max(0)
     floor, top = np.min(target, axis=0), np.max(target, axis=0)
     place = (floor + top) / 2 - (low + high) / 2
@@ -146,9 +154,13 @@ def _is_gltf(path: Path) -> bool:
 
 
 def transfer_file(
-    network: nn.Module, source: str | Path, target: str | Path, out: str | Path
+    network: nn.Module,
+    source: str | Path,
+    target: str | Path,
+    out: str | Path,
+    reach: float = REACH,
 ) -> None:
-    """Write the mesh of `target` in the pose of `source`.
+    """Write the mesh of `target` in the pose of `source`; `reach`: `transfer_pose`.
 
     Raises:
         HeadError: as `read_mesh` and `transfer_pose`; the message names the file.
@@ -157,7 +169,9 @@ def transfer_file(
     poser, mesh = read_mesh(source), read_mesh(target)
     edges = mesh_edges(np.asarray(mesh.faces))
     try:
-        mesh.vertices = transfer_pose(network, poser.vertices, mesh.vertices, edges)
+        mesh.vertices = transfer_pose(
+            network, poser.vertices, mesh.vertices, edges, reach
+        )
     except HeadError as error:
         file = source if error.field == "source" else target
         raise HeadError(error.field, error.found, error.fix, file) from error
