@@ -665,6 +665,7 @@ def pose_train(
     vertices: Annotated[tuple[int, ...], arg(metavar="N ...")] = (1229,),
     identities: Annotated[int, arg(metavar="I")] = 16,
     poses: Annotated[int, arg(metavar="T")] = 400,
+    wide: bool = False,
     network: Annotated[str, arg(metavar="NAME")] = "dsffnet",
     width: Annotated[int, arg(metavar="C")] = 1024,
     steps: Annotated[int, arg(metavar="N")] = 51_200,
@@ -692,6 +693,7 @@ def pose_train(
         vertices: Of each mesh that they are given; without a number, the one they have.
         identities: People to learn; of a folder three quarters are learnt.
         poses: How many each of them takes.
+        wide: Bend as far as joints can, not only as far as in the source's data.
         network: dsffnet, npt or corenet.
         width: Of the network; 256 has a fifteenth of the parameters.
         steps: How long to train, 8 pairs a step.
@@ -708,7 +710,10 @@ def pose_train(
     _check_seed(seed)
     if not 0 < rate < float("inf"):
         raise HeadError("--rate", f"{rate}", "give more than 0, such as 0.001")
-    population = Population(people, vertices, identities, poses=poses, seed=seed)
+    limits = "wide" if wide else "npt"
+    population = Population(
+        people, vertices, identities, poses=poses, limits=limits, seed=seed
+    )
     settings = {"width": width}
     if network != "corenet":  # the only one without this encoder
         settings["encoder"] = max(width // 16, 32)
