@@ -333,7 +333,14 @@ class DSFFNet(nn.Module):
                 tell from their mean; NaN; shapes that do not fit.
         """
         _check_points(source, identity)
-        code, points = self.encode(source), identity.mT.contiguous()
+        return self.decode(self.encode(source), identity)
+
+    def decode(self, code: Tensor, identity: Tensor) -> Tensor:
+        """(B, N, 3) the identity, (B, N, 3), in the pose of a code, (B, Z, 1).
+
+        A code need not come from a mesh: any mixture of two is one.
+        """
+        points = identity.mT.contiguous()
         h = points
         for conv, block in zip(self.convs, self.blocks, strict=False):
             h = block(conv(h), points, code)
