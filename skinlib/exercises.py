@@ -9,6 +9,7 @@ function) and returns a hint, or None when the answer is right.
 """
 
 import functools
+import tracemalloc
 from collections.abc import Callable
 from typing import Any
 
@@ -880,4 +881,65 @@ def _best_guess(best_guess: Callable) -> str | None:
         return "how far cycles are from the guess, not from each other"
     if not same(off, 0.5):
         return "2 of 8 places are 1 m off: the root of 2 / 8"
+    return None
+
+
+# ---- 17 pose transfer
+
+
+@exercise("17.1")
+def _side(side: Callable) -> str | None:
+    """`side(weight, bias, code, points)`: (N, C), the code never repeated."""
+    weight = np.array([[1.0, 0, 10, 0, 0], [0, 2, 0, 0, 1]])
+    bias, code = np.array([100.0, 200]), np.array([3.0, 4])
+    points = np.array([[1.0, 2, 3], [0, 0, 5], [7, 0, 0]])
+    found = np.asarray(side(weight, bias, code, points))
+    if found.shape != (3, 2):
+        return f"2 channels for each of 3 vertices, not {found.shape}"
+    right = np.array([[113, 211], [103, 213], [173, 208]])
+    if same(found, right - bias):
+        return "the bias is missing"
+    if same(found, right - [3, 8]):
+        return "the code is missing: its columns of the weights come first"
+    if not same(found, right):
+        return "by hand, the first vertex: 3 + 10 * 1 + 100 and 2 * 4 + 3 + 200"
+    rng = np.random.default_rng(0)
+    weight, code, points = (rng.normal(size=n) for n in ((2, 203), 200, (20_000, 3)))
+    tracemalloc.start()
+    try:
+        found = side(weight, bias, code, points)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    if peak > 8e6:  # repeated: 20,000 x 203 numbers, 32 MB
+        return f"{peak / 1e6:.0f} MB for a result of 0.3 MB: multiply the code once"
+    return None
+
+
+@exercise("17.2")
+def _full_size(full_size: Callable) -> str | None:
+    """`full_size(posed, target, edges)`: (N, 3) in the target's unit, on its floor."""
+    posed = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 2]])
+    target = np.array([[0.0, 0, 7], [0, 4, 7], [0, 9, 7]])
+    edges = np.array([[0, 1], [1, 2]])
+    found = np.asarray(full_size(posed.copy(), target.copy(), edges))
+    if found.shape != (3, 3):
+        return f"three vertices, not {found.shape}"
+    scale = found[1, 0] - found[0, 0]
+    for wrong, hint in {
+        3.25: "that is the mean of the ratios; long edges are to count for more",
+        3.0: "that is the ratio of the sums; make the sum of squares smallest",
+        4.5: "that is the ratio of the boxes, which a pose changes",
+    }.items():
+        if same(scale, wrong):
+            return f"scaled by {wrong:g}: {hint}"
+    if not same(scale, 2.8):
+        return "lengths 1 and 2 for 4 and 5: the best scale is (1 * 4 + 2 * 5) / 5"
+    if same(found[:, 2].min(), 0):
+        return "the target stands on z = 7"
+    if not same(found, 2.8 * posed + [0, 0, 7]):
+        return "scaled by 2.8, and then only lifted, to stand on z = 7"
+    deep = np.asarray(full_size(posed - [0, 0, 5], target, edges))
+    if not same(deep, 2.8 * (posed - [0, 0, 5]) + [0, 0, 21]):
+        return "the lowest vertex, wherever it was, comes to stand on the floor"
     return None

@@ -259,6 +259,26 @@ def best_guess(posed, period, factor=1.0):
     return guess, factor * np.sqrt(np.square(cycles - guess).sum(axis=-1).mean())
 
 
+def side(weight, bias, code, points):
+    length = len(code)
+    return points @ weight[:, length:].T + (weight[:, :length] @ code + bias)
+
+
+def repeated_side(weight, bias, code, points):
+    mixed = np.concatenate([np.tile(code, (len(points), 1)), points], axis=1)
+    return mixed @ weight.T + bias
+
+
+def full_size(posed, target, edges, scale=None, floor=True):
+    now, wanted = (
+        np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1) for p in (posed, target)
+    )
+    larger = posed * (scale or (now * wanted).sum() / (now**2).sum())
+    if floor:
+        larger[:, 2] += target[:, 2].min() - larger[:, 2].min()
+    return larger
+
+
 SOLUTIONS = {
     "00.1": right_bone,
     "00.2": keep_largest,
@@ -294,6 +314,8 @@ SOLUTIONS = {
     "15.2": for_engine,
     "16.1": heat,
     "16.2": best_guess,
+    "17.1": side,
+    "17.2": full_size,
 }
 WRONG = [
     ("00.1", lambda p, t: len(t) * right_bone(p, t), "divide"),
@@ -618,6 +640,23 @@ WRONG = [
     ("16.2", lambda *given: best_guess(*given, factor=3**-0.5), "three coordinates"),
     ("16.2", lambda *given: best_guess(*given, factor=8**0.5), "not from each other"),
     ("16.2", lambda *given: best_guess(*given, factor=3), "2 of 8"),
+    ("17.1", lambda *given: side(*given).T, "3 vertices"),
+    ("17.1", lambda w, b, c, v: side(w, 0 * b, c, v), "bias is missing"),
+    ("17.1", lambda w, b, c, v: side(w, b, 0 * c, v), "code is missing"),
+    ("17.1", lambda w, b, c, v: side(w, b, c[::-1], v), "by hand"),
+    ("17.1", repeated_side, "multiply the code once"),
+    ("17.2", lambda *given: full_size(*given)[0], "three vertices"),
+    ("17.2", lambda *given: full_size(*given, scale=3.25), "mean of the ratios"),
+    ("17.2", lambda *given: full_size(*given, scale=3.0), "ratio of the sums"),
+    ("17.2", lambda *given: full_size(*given, scale=4.5), "ratio of the boxes"),
+    ("17.2", lambda *given: full_size(*given, scale=2.0), "the best scale"),
+    ("17.2", lambda *given: full_size(*given, floor=False), "stands on z = 7"),
+    ("17.2", lambda *given: 1.0 + full_size(*given), "only lifted"),
+    (
+        "17.2",
+        lambda p, t, e: full_size(p, t, e, floor=False) + t * [0, 0, 1],
+        "the floor",
+    ),
 ]
 
 
