@@ -15,12 +15,12 @@ import torch.nn.functional as F
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from skinlib.head import Head
-from skinlib.pose_transfer.data import Pairs, normalised
+from skinlib.head import Head, Skeleton
+from skinlib.pose_transfer.data import Cast, Pairs, normalised
 from skinlib.pose_transfer.networks import NPT, DSFFNet, FFAdaIN
 from skinlib.views import garments, scenes
 from skinlib.views.picture import FAINT, ColourBar, Picture, new_figure, rasterise
-from skinlib.views.plots import OURS
+from skinlib.views.plots import DASHES, OURS
 from skinlib.views.widgets import SliderLab, slider_lab
 
 BOX = scenes.View(25.0, 6.0, zoom=0.92, centre=(0.0, 0.0, 0.0), upright=True)
@@ -32,6 +32,12 @@ LAYERS = ("1a", "1b", "2a", "2b", "3a", "3b", "out")
 
 
 # ---- one mesh
+
+
+def mesh_of(cast: Cast, who: int = 0) -> Head:
+    """The mesh that a cast is on, as one of its identities at rest; it has no rig."""
+    bone = Skeleton.from_heads_and_tails([[0, 0, 0]], None, [-1], ["none"])
+    return Head.create(cast.rest[who].cpu(), cast.faces.cpu(), bone)
 
 
 @functools.lru_cache(maxsize=32)
@@ -202,21 +208,21 @@ def pose_share(features: Tensor) -> float:
 def shares_plot(
     shares: Mapping[str, ArrayLike], ours: str = "DSFFNet", title: str = ""
 ) -> Picture:
-    """Lines over `LAYERS`, in percent.
+    """Lines over `LAYERS`, in percent, on a logarithmic axis.
 
     Args:
         shares: (7,) by name, as `pose_shares` gives them.
     """
-    greys = ["-", "--", ":", "-."]
     with new_figure(6.2, 3.2) as figure:
         axes = figure.subplots()
-        for name, values in shares.items():
-            look = {"color": FAINT, "linestyle": greys[len(axes.lines) % 4]}
+        for i, (name, values) in enumerate(shares.items()):
+            look = {"color": FAINT, "linestyle": DASHES[i % len(DASHES)]}
             if name == ours:
-                look = {"color": OURS, "linewidth": 2.2}
-            axes.plot(LAYERS, 100 * np.asarray(values), marker="o", label=name, **look)
+                look |= {"color": OURS, "linewidth": 2.2}
+            look |= {"marker": "os^*"[i % 4], "label": name}
+            axes.plot(LAYERS, 100 * np.asarray(values), **look)
         axes.set(xlabel="layer of the decoder", ylabel="spread due to the pose, %")
-        axes.set_ylim(bottom=0)
+        axes.set_yscale("log")
         axes.set_title(title, weight="bold")
         axes.legend()
         return rasterise(figure, title)
@@ -275,7 +281,7 @@ def mix_lab(
     last = len(sources) - 1
     return slider_lab(
         functools.partial(
-            mix_picture, network, mesh, identity, sources, size=(250, 280)
+            mix_picture, network, mesh, identity, sources, size=(200, 230)
         ),
         start={"second": last, "mix": 0.5, "view_from": 25.0} | start,
         first=(0, last),
