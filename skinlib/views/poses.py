@@ -305,7 +305,7 @@ def mixing_plot(
     """
     names = (r"$\alpha$, the scale", r"$\beta$, the shift")
     looks = ({"color": OURS}, {"color": FAINT, "linestyle": "--"})
-    with new_figure(5.8, 2.5) as figure:
+    with new_figure(5.2, 2.3) as figure:
         panels = figure.subplots(1, len(runs), squeeze=False)[0]
         for axes, (name, values) in zip(panels, runs.items(), strict=True):
             values = np.asarray(values)
