@@ -1,5 +1,7 @@
 """A result made locally stiff: the pose stays, the target's shape comes back."""
 
+import time
+
 import numpy as np
 import pytest
 import trimesh
@@ -89,11 +91,36 @@ def test_seams_stay_closed():
     np.testing.assert_allclose(torn, whole[BALL.faces.reshape(-1)], atol=1e-9)
 
 
+def test_a_shirt_stays_on_the_body():
+    """Two balls, one round the other, whose distance no edge of the mesh keeps."""
+    points = np.concatenate([POINTS, 1.02 * POINTS])
+    edges = np.concatenate([EDGES, EDGES + len(POINTS)])
+    rng = np.random.default_rng(0)
+    posed = points * [1, 1, 1.3]
+    noisy = posed + rng.normal(0, 0.05, posed.shape)
+    found = as_rigid_as_possible(noisy, points, edges)
+    inner, outer = np.split(found, 2)
+    gap = np.linalg.norm(outer, axis=1) - np.linalg.norm(inner, axis=1)
+    raw = np.linalg.norm(np.split(noisy, 2), axis=-1)
+    assert (gap > 0).mean() > 0.9 > 0.7 > (raw[1] > raw[0]).mean()
+
+
 def test_without_reach_or_edges_nothing_happens():
     noisy = POINTS + 0.1
     for edges, reach in ((EDGES, 0), (EDGES[:0], 0.1)):
         found = as_rigid_as_possible(noisy, POINTS, edges, reach)
         np.testing.assert_array_equal(found, noisy)
+
+
+def test_many_small_pieces_are_quick():
+    places = np.random.default_rng(0).uniform(-1, 1, (3000, 1, 3))
+    corners = np.eye(3) * 0.01
+    points = (places + corners).reshape(-1, 3)
+    edges = mesh_edges(np.arange(len(points)).reshape(-1, 3))
+    began = time.monotonic()
+    found = as_rigid_as_possible(points, points, edges)
+    assert time.monotonic() - began < 30
+    np.testing.assert_allclose(found, points, atol=1e-9)
 
 
 def test_bad_input():

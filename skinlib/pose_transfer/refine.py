@@ -7,14 +7,17 @@ where the network wants it.
 """
 
 import numpy as np
-from scipy.sparse import csr_matrix, diags
+from scipy.sparse import coo_matrix, csr_matrix, diags
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import factorized
+from scipy.spatial import cKDTree
 
 from skinlib.geometry import row_dot, weld
 from skinlib.head import HeadError
 
 REACH = 0.07  # of the target's size: so far a vertex feels the others
 ROUNDS = 10
+AROUND = 64  # vertices among which one of another piece is looked for
 
 
 def as_rigid_as_possible(
@@ -62,13 +65,14 @@ def as_rigid_as_possible(
     edges = np.unique(np.sort(place[edges], axis=1), axis=0)
     edges = edges[edges[:, 0] != edges[:, 1]]
     y, p = points[first], target[first]
-    a, b = np.concatenate([edges, edges[:, ::-1]]).T
-    if not len(a) or not reach:
+    if not len(edges) or not reach:
         return points
+    count, size = len(p), np.ptp(p, axis=0).max()
+    sides = p[edges[:, 0]] - p[edges[:, 1]]
+    stiffness = (reach * size / np.sqrt(row_dot(sides, sides)).mean()) ** 2
+    edges = np.concatenate([edges, _ties(p, edges, reach * size)])
+    a, b = np.concatenate([edges, edges[:, ::-1]]).T
     rest = p[a] - p[b]
-    size = np.ptp(p, axis=0).max()
-    stiffness = (reach * size / np.sqrt(row_dot(rest, rest)).mean()) ** 2
-    count = len(p)
     gather = csr_matrix((np.ones(len(a)), (a, np.arange(len(a)))), (count, len(a)))
     degree = np.bincount(a, minlength=count)
     neighbours = csr_matrix((np.ones(len(a)), (a, b)), (count, count))
@@ -83,6 +87,20 @@ def as_rigid_as_possible(
         right = y + stiffness * (gather @ pulled)
         x = np.stack([solve(column) for column in right.T], axis=1)
     return x[place]
+
+
+def _ties(points: np.ndarray, edges: np.ndarray, reach: float) -> np.ndarray:
+    """(T, 2) from each vertex to the nearest one of another piece, within reach."""
+    count = len(points)
+    graph = coo_matrix((np.ones(len(edges)), tuple(edges.T)), (count, count))
+    pieces, piece = connected_components(graph, directed=False)
+    if pieces == 1:
+        return np.zeros((0, 2), np.int64)
+    distance, found = cKDTree(points).query(points, k=min(AROUND, count))
+    other = (piece[found] != piece[:, None]) & (distance < reach)
+    tied = np.flatnonzero(other.any(axis=1))
+    ties = np.stack([tied, found[tied, other[tied].argmax(axis=1)]], axis=1)
+    return np.unique(np.sort(ties, axis=1), axis=0)
 
 
 def _rotations(matrices: np.ndarray) -> np.ndarray:
