@@ -15,11 +15,17 @@ from PIL import Image
 from pose_transfer import NOISE, QUICK, other_meshes, quick_mesh
 from torch import nn
 
+from skinlib.garments.body import read_body
+from skinlib.garments.garment import read_garment
+from skinlib.garments.outfit import Outfit
 from skinlib.geometry import mesh_edges
 from skinlib.head import Head
+from skinlib.paths import sample
 from skinlib.pose_transfer.data import Cast, Pairs, PosePairs, normalised, size_by_edges
 from skinlib.pose_transfer.refine import as_rigid_as_possible
 from skinlib.pose_transfer.training import load_network
+from skinlib.pose_transfer.transfer import transfer_pose
+from skinlib.views import garments
 from skinlib.views.picture import (
     ColourBar,
     Picture,
@@ -45,6 +51,7 @@ def main(runs: tyro.conf.Positional[Path]) -> None:
     mixed, _ = load_network(runs / "long" / "mixed")
     keep("meshes", meshes(mixed, cast))
     keep("noise", noise(networks["DSFFNet"], cast))
+    keep("dressed", dressed(cast))
     keep("curves", curves(runs))
 
 
@@ -124,6 +131,24 @@ def noise(network: nn.Module, cast: Cast) -> Picture:
         columns=1 + len(NOISE),
         row_titles=["source", "result"],
     )
+
+
+def dressed(cast: Cast) -> Picture:
+    """The shipped body in a T-shirt, one mesh without a rig, by the shipped network."""
+    network, _ = load_network("poses")
+    pairs = PosePairs(cast, cast, 20, 3, poses=UNSEEN).batch(SHOWN)
+    sources = in_mesh_order(pairs.source, pairs.source_order)
+    outfit = Outfit.create(read_body(), [read_garment(sample("t_shirt.npz"))])
+    target = garments.dressed(outfit)
+    colours = np.tile(garments.SKIN, (len(target.vertices), 1))
+    colours[len(outfit.body.head.vertices) :] = garments.CLOTHS[0]
+    edges, size = mesh_edges(target.faces), (200, 224)
+    images = [draw(quick_mesh(), s, colours=GIVEN, size=size) for s in sources]
+    for source in sources:
+        posed = transfer_pose(network, source, target.vertices, edges)
+        images.append(draw(target, normalised(posed)[0], colours=colours, size=size))
+    rows = ["source", "target, moved"]
+    return picture_grid(images, columns=len(sources), row_titles=rows)
 
 
 def curves(runs: Path) -> Picture:
