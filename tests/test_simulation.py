@@ -1,6 +1,7 @@
 """Cloth falls, hangs, lies and slides as it should, twice to the same bit."""
 
 import json
+import os
 import sys
 from dataclasses import replace
 
@@ -23,6 +24,7 @@ from skinlib.garments.simulation import (
     inside,
     obstacle,
     predictability,
+    quiet,
     read_simulated,
     rms,
     root_frame,
@@ -368,3 +370,14 @@ def test_without_warp_it_says_what_to_install(head, monkeypatch):
     simulation._kernels.cache_clear()
     with pytest.raises(HeadError, match="pip install warp-lang"):
         simulate(sheet(), head, still(2), AT_ONCE)
+
+
+def test_quiet_hides_what_native_code_says(capfd):
+    with quiet():
+        os.write(2, b"nobody hears this")
+    os.write(2, b"but this")
+    assert capfd.readouterr().err == "but this"
+    with pytest.raises(KeyError), quiet():
+        raise KeyError
+    os.write(2, b"and this")
+    assert capfd.readouterr().err == "and this"

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from skinlib.animation import AnimatedMesh, write_animation
 from skinlib.garments.binding import closest_point_weights, smooth
 from skinlib.garments.body import Body, read_body, write_body
+from skinlib.garments.fitting import SkinningError
 from skinlib.garments.garment import Garment, read_garment, write_garment
 from skinlib.garments.motion import Motion, training_motions, walk
 from skinlib.garments.outfit import BODY, CLOTH_COLOURS, FRAMES, SKIN_COLOUR
@@ -48,7 +49,6 @@ from skinlib.garments.virtual_bones import (
     prune_joints,
     virtual_bind,
 )
-from skinlib.geometry import mesh_edges
 from skinlib.head import HeadError, Skeleton
 from skinlib.skinning import linear_blend_skinning
 from skinlib.training.checkpoint import (
@@ -230,7 +230,8 @@ class LooseGarment:
             carriers(local, self.carried, self.points[:count]),
             local[:, self.joints] @ self._binds,
         )
-        return Inputs(*(torch.tensor(part, dtype=torch.float32) for part in found))
+        arrays = (part.astype(np.float32, copy=False) for part in found)
+        return Inputs(*map(torch.from_numpy, arrays))
 
     def pose(self, motion: Motion) -> np.ndarray:
         """(T, V, 3) float32 the garment in each frame of a motion.
@@ -349,15 +350,7 @@ def bind(
     """
     rest = _checked_rest(body, garment, simulated)
     skeleton = body.head.skeleton
-    bones = place_bones(rest, garment.faces, config.bones, config.seed)
-    distances = bone_distances(rest, garment.faces, bones)
-    alpha = config.alpha
-    if alpha is None:
-        alpha = bone_spacing(distances, bones)
-    shares = fading_heat if config.fade else heat_weights
-    heat = shares(distances, alpha, config.influences, config.kernel)
     nearest = joint_weights(garment, rest, body)
-
     every = max(1, sum(len(s.motion) for s in simulated) // LOOKED_AT)
     seen, skinned, drape = [], [], np.zeros(rest.shape)
     for motion, posed, _ in simulated:
@@ -370,6 +363,15 @@ def bind(
     loose = np.ones(len(rest), np.float32)
     if config.hybrid:
         loose = looseness(skinned, seen, config.threshold, config.slope, config.reduce)
+
+    around = _loose_faces(garment.faces, loose, config.bones)
+    bones = place_bones(rest, around, config.bones, config.seed)
+    distances = bone_distances(rest, garment.faces, bones)
+    alpha = config.alpha
+    if alpha is None:
+        alpha = bone_spacing(distances, bones)
+    shares = fading_heat if config.fade else heat_weights
+    heat = shares(distances, alpha, config.influences, config.kernel)
     _, read = prune_joints(nearest, config.least)
     weights = hybrid_weights(loose, heat, nearest)
     weights, columns = prune_joints(weights, config.least, len(bones))
@@ -388,6 +390,15 @@ def bind(
         read=read,
         carried=smooth(nearest, garment.faces, CARRIED)[bones],
     )
+
+
+def _loose_faces(faces: np.ndarray, loose: np.ndarray, count: int) -> np.ndarray:
+    """(G, 3) those on which `count` virtual bones are of use: joints hold the others.
+
+    All of them, where too little of a garment is loose.
+    """
+    found = faces[(loose[faces] > 0.5).all(axis=1)]
+    return found if len(np.unique(found)) >= count else faces
 
 
 def fading_heat(
@@ -508,17 +519,19 @@ class LooseTrainer(Run):
                 for end, length in zip(ends, lengths, strict=True)
             ]
         )
-        device = config.device
-        parts = []
+        device, parts, truth = config.device, [], []
         for motion, posed, _ in simulated:
             transforms = motion.transforms(body.head.skeleton)
-            local = torch.from_numpy(root_frame(posed, transforms[:, 0]))
-            parts.append((*self.garment.inputs(transforms, motion.fps), local))
+            parts.append(self.garment.inputs(transforms, motion.fps))
+            truth.append(root_frame(posed, transforms[:, 0]))
         self.data = [torch.cat(kind).to(device) for kind in zip(*parts, strict=True)]
+        given = self.garment.rest, self.garment.weights, garment.faces
+        truth = np.concatenate(truth)
+        self.error = SkinningError(*given, truth).to(device)
+        self.loss = SkinningError(*given, truth, config.edges).to(device)
         self.garment.network.standardise(self.data[0].cpu())
         self.network = self.garment.network.to(device)
-        self.tensors = [part.to(device) for part in self.garment._tensors]
-        self.edges = torch.from_numpy(mesh_edges(garment.faces).T.copy()).to(device)
+        self.offsets = self.garment._tensors[2].to(device)
         self._start(config, out, [{"params": list(self.network.parameters())}])
 
     def step(self) -> dict[str, float]:
@@ -527,18 +540,14 @@ class LooseTrainer(Run):
         rng = np.random.default_rng((config.seed, 2, self.steps_done))
         starts = rng.choice(self.starts, config.batch)
         frames = torch.from_numpy(starts[:, None] + np.arange(config.window))
-        features, carrier, joints, truth = (
-            part[frames.to(part.device)] for part in self.data
-        )
-        rest, weights, offsets = self.tensors
+        features, carrier, joints = (part[frames.to(part.device)] for part in self.data)
         placed = torch.cat([self.network(features, carrier), joints], dim=2)
         scored = slice(config.unscored, None)
-        posed = hybrid_skinning(rest, weights, placed[:, scored], offsets)
-        off = posed - truth[:, scored]
-        error = off.square().sum(-1).mean()
-        a, b = self.edges  # the error of a vertex does not tell whether cloth is torn
-        torn = (off[..., a, :] - off[..., b, :]).square().sum(-1).mean()
-        loss = error + config.edges * torn
+        moved, frames = placed[:, scored] @ self.offsets, frames[:, scored]
+        with torch.no_grad():
+            error = self.error(moved, frames).mean()
+        # The error of a vertex does not tell whether cloth is torn; edges do.
+        loss = self.loss(moved, frames).mean()
         self.optimizer.zero_grad()
         loss.backward()
         if not torch.isfinite(loss):

@@ -17,8 +17,10 @@ Symbols: T frames, V garment vertices, B body vertices, J bones.
 """
 
 import json
+import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cache
 from multiprocessing import get_context
@@ -373,6 +375,19 @@ class Simulator:
 
         values = np.ascontiguousarray(values, np.float32)
         return wp.array(values, dtype=wp.vec3, device=self.device)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Without what native code writes to stderr, past Python: Warp misses a GPU."""
+    kept, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(sink)
 
 
 @cache
