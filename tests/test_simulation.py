@@ -2,8 +2,11 @@
 
 import json
 import os
+import subprocess
 import sys
+import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -273,6 +276,43 @@ def test_two_processes_make_what_one_makes(job, tmp_path):
     one = simulate_motions(garment, head, motions, tmp_path / "one", config)
     two = simulate_motions(garment, head, motions, tmp_path / "two", config, workers=2)
     assert [p.read_bytes() for p in one] == [p.read_bytes() for p in two]
+
+
+POOL = """
+import os, time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from skinlib.garments.simulation import _end_with_parent
+
+if __name__ == "__main__":
+    with ProcessPoolExecutor(1, get_context("spawn"), _end_with_parent) as pool:
+        print(pool.submit(os.getpid).result(), flush=True)
+        time.sleep(60)
+"""
+
+
+def test_workers_end_with_a_killed_command(tmp_path):
+    script = tmp_path / "pool.py"
+    script.write_text(POOL)
+    with subprocess.Popen(
+        [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as command:
+        worker = Path("/proc", command.stdout.readline().decode().strip())
+        if not worker.exists():
+            pytest.skip("there is no /proc to look into")
+        command.kill()
+    end = time.monotonic() + 20
+    while worker.exists() and time.monotonic() < end:
+        time.sleep(0.1)
+    assert not worker.exists()
+
+
+def test_a_motion_that_does_not_fit_leaves_nothing_behind(job, tmp_path):
+    garment, head, motions, config = job
+    other = Motion.create(np.zeros((3, 1, 3)), ["alone"])
+    with pytest.raises(HeadError, match="the motion has .alone."):
+        simulate_motions(garment, head, [*motions, other], tmp_path / "new", config)
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_folder_holds_one_data_set(job, tmp_path):

@@ -23,8 +23,9 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cache
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
+from threading import Thread
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -406,7 +407,8 @@ def _kernels() -> SimpleNamespace:
             "run `pip install warp-lang`",
         ) from error
     level, wp.config.log_level = wp.config.log_level, wp.LOG_ERROR
-    wp.init()  # else it writes what devices there are
+    with quiet():
+        wp.init()  # else it writes what devices there are
     wp.config.log_level = max(level, wp.LOG_WARNING)
     gravity = wp.constant(GRAVITY)
 
@@ -711,10 +713,11 @@ def simulate_motions(
     """
     config, out = config or SimulationConfig(), Path(out)
     paths = [out / f"motion_{number:04d}.npz" for number in range(len(motions))]
+    for motion in motions:
+        motion.transforms(head.skeleton)  # rather now than after an hour
     _begin(out, garment, head, config)
     missing = []
     for motion, path in zip(motions, paths, strict=True):
-        motion.transforms(head.skeleton)  # rather now than after an hour
         if path.exists():
             _check_same(motion, path)
         else:
@@ -731,7 +734,8 @@ def simulate_motions(
                 bar.update()
             return paths
         # A forked process could not use CUDA.
-        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        context = get_context("spawn")
+        with ProcessPoolExecutor(workers, context, _end_with_parent) as pool:
             job = garment, head, config, device, rest
             pending = [pool.submit(_simulate_to, *job, *pair) for pair in missing]
             try:
@@ -780,6 +784,16 @@ def read_simulated(path: str | Path) -> Simulated:
             path,
         )
     return Simulated(motion, posed.astype(np.float32), rest.astype(np.float32))
+
+
+def _end_with_parent() -> None:
+    """A process of a pool would wait for ever when the command has been killed."""
+
+    def watch():
+        parent_process().join()
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()
 
 
 def _simulate_to(garment, head, config, device, rest, motion, path) -> None:

@@ -675,7 +675,8 @@ class VirtualBonesNet(nn.Module):
         Args:
             features: (B, T, F), whole sequences. carrier: (B, T, N, 4, 4).
         """
-        return self._run(features, carrier, None)[0]
+        hidden, _ = self.memory(self._encoded(features))
+        return self._placed(hidden, carrier)
 
     def step(
         self, feature: Tensor, carrier: Tensor, state: Tensor | None = None
@@ -688,21 +689,24 @@ class VirtualBonesNet(nn.Module):
             feature: (B, F). carrier: (B, N, 4, 4).
             state: of the frame before; none at the start.
         """
-        transforms, state = self._run(feature[:, None], carrier[:, None], state)
-        return transforms[:, 0], state
+        hidden, memory = self._encoded(feature), self.memory
+        state = torch.zeros_like(hidden) if state is None else state
+        inner = memory.weight_ih_l0, memory.weight_hh_l0
+        inner += memory.bias_ih_l0, memory.bias_hh_l0
+        state = torch.gru_cell(hidden, state, *inner)  # `memory` takes twice as long
+        return self._placed(state, carrier), state
 
-    def _run(
-        self, features: Tensor, carrier: Tensor, state: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        hidden = self.encoder((features - self.mean) / self.scale)
-        hidden, state = self.memory(hidden, state)
+    def _encoded(self, features: Tensor) -> Tensor:
+        return self.encoder((features - self.mean) / self.scale)
+
+    def _placed(self, hidden: Tensor, carrier: Tensor) -> Tensor:
         change = self.decoder(hidden).unflatten(-1, (self.bones, -1))
         place = carrier[..., :3, 3:] + change[..., :3, None]
         turned = carrier[..., :3, :3]
         if self.config.rotate:
             turned = rotation_from_columns(change[..., 3:]) @ turned
         top = torch.cat([turned, place], dim=-1)
-        return torch.cat([top, carrier[..., 3:, :]], dim=-2), state
+        return torch.cat([top, carrier[..., 3:, :]], dim=-2)
 
 
 def rotation_from_columns(change: Tensor) -> Tensor:

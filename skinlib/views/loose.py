@@ -20,7 +20,6 @@ from skinlib.garments.simulation import (
     SimulationConfig,
     Simulator,
     predictability,
-    quiet,
 )
 from skinlib.garments.virtual_bones import (
     KERNELS,
@@ -301,8 +300,7 @@ def periodic(
     """
     period = round(fps)
     motion = walk(head.skeleton, cycles + 2, speed=1.0, stride=30, fps=fps)
-    with quiet():
-        simulator = Simulator(garment, head, SimulationConfig(smoothing=smoothing))
+    simulator = Simulator(garment, head, SimulationConfig(smoothing=smoothing))
     frames = simulator.frames(motion, simulator.settled())
     posed = np.stack(list(frames))[2 * period :]
     found = predictability(posed, period)
