@@ -23,6 +23,7 @@ from skinlib.garments.motion import Motion
 from skinlib.garments.simulation import (
     Simulation,
     SimulationConfig,
+    check_simulated,
     colour_pairs,
     inside,
     obstacle,
@@ -310,7 +311,7 @@ def test_workers_end_with_a_killed_command(tmp_path):
 def test_a_motion_that_does_not_fit_leaves_nothing_behind(job, tmp_path):
     garment, head, motions, config = job
     other = Motion.create(np.zeros((3, 1, 3)), ["alone"])
-    with pytest.raises(HeadError, match="the motion has .alone."):
+    with pytest.raises(HeadError, match="the motion has 'alone'"):
         simulate_motions(garment, head, [*motions, other], tmp_path / "new", config)
     assert not (tmp_path / "new").exists()
 
@@ -336,6 +337,24 @@ def test_a_folder_holds_one_data_set(job, tmp_path):
 
 
 # --- measures -------------------------------------------------------------------------
+
+
+def test_simulations_of_another_garment_or_body_are_not_taken(job, tmp_path):
+    garment, head, motions, config = job
+    simulate_motions(garment, head, motions[2:], tmp_path, config)
+    check_simulated(tmp_path, garment, head)
+    with pytest.raises(HeadError, match="garment: it is another one"):
+        check_simulated(tmp_path, sleeve(0.115, pinned=False), head)
+    taller = Head.create(
+        head.vertices * 1.01, head.faces, head.skeleton, weights=head.weights
+    )
+    with pytest.raises(HeadError, match="body: it is another one"):
+        check_simulated(tmp_path, garment, taller)
+    (tmp_path / "simulation.json").write_text("[")
+    with pytest.raises(HeadError, match="simulation: it cannot be read"):
+        check_simulated(tmp_path, garment, head)
+    (tmp_path / "simulation.json").unlink()
+    check_simulated(tmp_path, garment, taller)  # by another simulator
 
 
 def test_strain_of_known_lengths():

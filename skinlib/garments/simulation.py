@@ -821,16 +821,7 @@ def _begin(out: Path, garment: Garment, head: Head, config: SimulationConfig) ->
     Raises:
         HeadError: something else is.
     """
-    arrays = {
-        "garment": (garment.vertices, garment.faces, garment.pinned),
-        "body": (head.vertices, head.faces, head.weights, head.skeleton.joints),
-    }
-    meshes = {
-        name: crc32(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
-        for name, parts in arrays.items()
-        if all(part is not None for part in parts)
-    }
-    run = json.loads(json.dumps(asdict(config) | meshes))
+    run = json.loads(json.dumps(asdict(config) | _checksums(garment, head)))
     path = out / RUN
     if not path.exists():
         try:
@@ -844,12 +835,7 @@ def _begin(out: Path, garment: Garment, head: Head, config: SimulationConfig) ->
             ) from error
         replace_file(path, f"{json.dumps(run, indent=1)}\n".encode())
         return
-    try:
-        before = dict(json.loads(path.read_bytes()))
-    except (OSError, ValueError, TypeError) as error:
-        raise HeadError(
-            "simulation", "it cannot be read", "choose a new folder", path
-        ) from error
+    before = _begun(path)
     differs = [key for key in run if before.get(key) != run[key]]
     if differs:
         raise HeadError(
@@ -858,6 +844,50 @@ def _begin(out: Path, garment: Garment, head: Head, config: SimulationConfig) ->
             "continue it with the arguments it was begun with, or choose a new folder",
             out,
         )
+
+
+def check_simulated(folder: str | Path, garment: Garment, head: Head) -> None:
+    """Make sure that `simulate_motions` filled a folder with this garment and body.
+
+    A folder that it has not begun, as of another simulator, may hold anything.
+
+    Raises:
+        HeadError: it was another one.
+    """
+    path = Path(folder) / RUN
+    if not path.exists():
+        return
+    before = _begun(path)
+    for name, checksum in _checksums(garment, head).items():
+        if before.get(name) != checksum:
+            raise HeadError(
+                name,
+                "it is another one than in the simulation",
+                "give the mesh, the pins and the body that were simulated",
+                path,
+            )
+
+
+def _begun(path: Path) -> dict:
+    """What `_begin` noted."""
+    try:
+        return dict(json.loads(path.read_bytes()))
+    except (OSError, ValueError, TypeError) as error:
+        raise HeadError(
+            "simulation", "it cannot be read", "choose a new folder", path
+        ) from error
+
+
+def _checksums(garment: Garment, head: Head) -> dict[str, int]:
+    arrays = {
+        "garment": (garment.vertices, garment.faces, garment.pinned),
+        "body": (head.vertices, head.faces, head.weights, head.skeleton.joints),
+    }
+    return {
+        name: crc32(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
+        for name, parts in arrays.items()
+        if all(part is not None for part in parts)
+    }
 
 
 def _check_same(motion: Motion, path: Path) -> None:
