@@ -20,7 +20,7 @@ class SkinningError(nn.Module):
 
     e = 1/V sum_i |v_i - g_i|^2 + k/E sum_e |(v_a - v_b) - (g_a - g_b)|^2
 
-    Part of equation `hybrid_skinning`. With A X the scaled vertices and edges in a
+    Equation `hybrid_skinning`, its loss. With A X the scaled vertices and edges in a
     frame, X (4C, 3) the bones' matrices, G the true ones and A = Q R,
 
     e = |A X - G|^2 = |R X - Q^T G|^2 + |G|^2 - |Q^T G|^2.
