@@ -239,7 +239,7 @@ class LooseGarment:
         skeleton, count = self.body.head.skeleton, len(self.bones)
         local = in_root_frame(transforms)
         found = (
-            pose_features(transforms, skeleton, self.read, fps, before),
+            pose_features(transforms, skeleton, self.read, fps, before, local=local),
             carriers(local, self.carried, self.points[:count]),
             local[:, self.joints] @ self._binds,
         )

@@ -42,7 +42,6 @@ THRESHOLD = 0.003  # metres: LBS this far from the truth is good enough
 SLOPE = 100.0  # per metre: 1 cm further and a vertex is loose altogether
 LEAST_TOTAL = 0.5  # vertices: a joint that moves less of a garment is left out
 LEAST_SPREAD = 1e-3  # of a feature: one that hardly varies is noise, not blown up
-GRAVITY = np.array([0.0, 0, -1])
 
 
 # --- where virtual bones sit ----------------------------------------------------------
@@ -561,6 +560,7 @@ def pose_features(
     fps: float,
     before: np.ndarray | None = None,
     root: int = 0,
+    local: np.ndarray | None = None,
 ) -> np.ndarray:
     """(T, 9 K + 9) float32: what the network reads, the same wherever the body faces.
 
@@ -572,6 +572,7 @@ def pose_features(
         transforms: (T, J, 4, 4) from rest, of successive frames.
         joints: (K,) ids. fps: frames per second, above 0.
         before: (4, 4) of the root, one frame before; without it the root starts still.
+        local: (T, J, 4, 4) from `in_root_frame`, if known.
     """
     joints = np.asarray(joints, np.int64)
     if not len(joints):
@@ -579,21 +580,23 @@ def pose_features(
     if not 0 < fps < np.inf:
         raise HeadError("fps", f"it is {fps:g}", "give frames per second")
     _check_finite("transforms", transforms)
-    roots = transforms[:, root].astype(np.float64)
-    local = undone(roots)[:, None] @ transforms[:, joints]
+    if local is None:
+        local = in_root_frame(transforms, root)
+    local = local[:, joints]
     points = skeleton.joints[joints].astype(np.float64)
     places = (local[..., :3, :3] @ points[..., None])[..., 0] + local[..., :3, 3]
     columns = local[..., :3, :2].swapaxes(-1, -2).reshape(*places.shape[:2], 6)
 
+    roots = transforms[:, root].astype(np.float64)
     first = roots[:1] if before is None else before[None].astype(np.float64)
     last = np.concatenate([first, roots[:-1]])
     since = undone(last) @ roots  # from the last frame to this one, in its axes
     turned = rotation_vectors(since[:, :3, :3])
     hip = skeleton.joints[root].astype(np.float64)
     path = (roots - last)[:, :3, :3] @ hip + (roots - last)[:, :3, 3]
-    down = np.broadcast_to(GRAVITY, path.shape)
-    along = np.stack([path * fps, down], axis=1) @ roots[:, :3, :3]  # R^T of both
-    parts = [columns, places, along[:, :1], turned[:, None] * fps, along[:, 1:]]
+    along = path[:, None] @ roots[:, :3, :3]  # R^T of it
+    down = -roots[:, 2, :3]  # R^T of what points down
+    parts = [columns, places, fps * along, fps * turned, down]
     flat = [part.reshape(len(roots), -1) for part in parts]
     return np.concatenate(flat, axis=1).astype(np.float32)
 
