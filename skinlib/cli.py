@@ -449,7 +449,7 @@ def garment_train(
         shapes: Learn the shapes of the body and looser cuts, too.
         smooth: Rounds of smoothing of the skin weights; 10, or 50 for what is pinned.
         steps: How long to train: 10,000 steps unless simulated, which are ten to
-            fifteen minutes; then 800, a minute or two.
+            fifteen minutes; then 1,600, a minute or two.
         seed: Same seed, same garment.
         device: Where to compute, such as cpu or cuda.
         threads: CPU cores to use.
