@@ -449,7 +449,7 @@ def garment_train(
         shapes: Learn the shapes of the body and looser cuts, too.
         smooth: Rounds of smoothing of the skin weights; 10, or 50 for what is pinned.
         steps: How long to train: 10,000 steps unless simulated, which are ten to
-            fifteen minutes; then 800, a minute or two.
+            fifteen minutes; then 1,600, a minute or two.
         seed: Same seed, same garment.
         device: Where to compute, such as cpu or cuda.
         threads: CPU cores to use.
@@ -499,13 +499,16 @@ def garment_train(
 def _train_loose(outfit, simulated: Path, out: Path, steps: int | None, **settings):
     """Train a garment on virtual bones."""
     from skinlib.garments.loose import LooseConfig, read_simulations, train
+    from skinlib.garments.simulation import check_simulated
 
     if len(outfit.garments) > 1:
         raise HeadError("MESH", "several garments", "simulate and train one at a time")
     if steps is not None:
         settings["steps"] = steps
     config, (garment,) = LooseConfig(**settings), outfit.garments
-    train(config, outfit.body, garment, read_simulations(simulated), out)
+    learnt = read_simulations(simulated)
+    check_simulated(simulated, garment, outfit.body.head)
+    train(config, outfit.body, garment, learnt, out)
     print(
         f"{out}: play it with `skinlib garment play {out} --poses walk --out OUT.glb`"
     )

@@ -31,7 +31,7 @@ from skinlib.garments.loose import (
 )
 from skinlib.garments.motion import Motion
 from skinlib.garments.outfit import load_outfit
-from skinlib.garments.simulation import Simulated
+from skinlib.garments.simulation import Simulated, inside, obstacle
 from skinlib.garments.virtual_bones import VirtualBonesConfig, heat_weights
 from skinlib.geometry import mesh_edges
 from skinlib.head import HeadError
@@ -47,6 +47,7 @@ CONFIG = LooseConfig(
     batch=3,
     window=8,
     unscored=2,
+    collision=0,  # the sleeve swings as if there were no body
     threads=1,
     network=SMALL,
 )
@@ -111,6 +112,23 @@ def test_virtual_bones_have_what_is_loose_and_joints_the_rest(simulated):
     assert np.abs(stiff.weights[:, :6]).max() == 0
 
 
+def test_bones_sit_on_what_is_loose(simulated):
+    garment = bind(replace(CONFIG, threshold=0.04), BODY, CLOTH, simulated)
+    share = garment.weights[:, :6].sum(axis=1)
+    assert share[garment.bones].min() > 0.5 > share.min()
+    alone = bind(replace(CONFIG, hybrid=False), BODY, CLOTH, simulated)
+    assert alone.rest[alone.bones, 2].max() > garment.rest[garment.bones, 2].max()
+    stiff = bind(replace(CONFIG, threshold=9.0), BODY, CLOTH, simulated)
+    assert np.array_equal(stiff.bones, alone.bones)  # nowhere else to be
+
+
+def test_without_joints_the_root_carries_the_bones(simulated):
+    garment = bind(replace(CONFIG, hybrid=False, carry=False), BODY, CLOTH, simulated)
+    motion = simulated[1].motion
+    rigid = garment.baselines(motion)["rigid"]
+    assert np.abs(garment.pose(motion) - rigid).max() < 1e-5
+
+
 def test_where_nothing_is_loose_the_garment_is_skinned(simulated):
     stiff = bind(replace(CONFIG, threshold=9.0, least=0), BODY, CLOTH, simulated)
     motion = simulated[1].motion
@@ -168,6 +186,8 @@ def test_simulations_that_do_not_fit_are_refused(simulated, tmp_path, change, me
         ({"unscored": -1}, "unscored"),
         ({"unscored": 8}, "unscored"),
         ({"bones": 0}, "bones"),
+        ({"edges": -1.0}, "edges"),
+        ({"collision": float("nan")}, "collision"),
         ({"alpha": -1.0}, "alpha"),
         ({"kernel": "box"}, "kernel"),
         ({"reduce": "max"}, "reduce"),
@@ -209,11 +229,12 @@ def test_the_same_call_gives_the_same_bits(simulated, tmp_path):
     assert same(first, again) and same(first, load_loose(tmp_path / "a"))
 
 
-@pytest.mark.parametrize("steps", [0, 1, 4])
+@pytest.mark.parametrize(("steps", "collision"), [(0, 0), (1, 30), (4, 0)])
 def test_an_interrupted_run_ends_in_the_same_bits(
-    simulated, tmp_path, monkeypatch, steps
+    simulated, tmp_path, monkeypatch, steps, collision
 ):
-    whole = train(CONFIG, BODY, CLOTH, simulated, tmp_path / "whole")
+    config = replace(CONFIG, collision=collision)
+    whole = train(config, BODY, CLOTH, simulated, tmp_path / "whole")
     step = LooseTrainer.step
 
     def stopping(self):
@@ -223,10 +244,10 @@ def test_an_interrupted_run_ends_in_the_same_bits(
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(LooseTrainer, "step", stopping)
-        train(CONFIG, BODY, CLOTH, simulated, tmp_path / "run")
+        train(config, BODY, CLOTH, simulated, tmp_path / "run")
     with pytest.raises(HeadError, match="its training has not ended"):
         load_loose(tmp_path / "run")
-    trainer = LooseTrainer(CONFIG, BODY, CLOTH, simulated, tmp_path / "run")
+    trainer = LooseTrainer(config, BODY, CLOTH, simulated, tmp_path / "run")
     assert trainer.steps_done == steps
     trainer.run()
     assert same(trainer.garment, whole)
@@ -287,9 +308,20 @@ def test_errors_of_edges_keep_the_cloth_whole(simulated, tmp_path):
     assert torn[30.0] < 0.95 * torn[0.0]
 
 
+def test_cloth_is_kept_off_the_body(simulated, tmp_path):
+    deep = {}
+    part = obstacle(CLOTH, BODY.head)
+    for weight in (0, 30):
+        config = replace(CONFIG, steps=100, learning_rate=1e-2, collision=weight)
+        garment = train(config, BODY, CLOTH, simulated, tmp_path / str(weight))
+        motion = simulated[1].motion
+        deep[weight] = inside(garment.pose(motion), motion, BODY.head, part).mean()
+    assert deep[30] < 0.5 * deep[0]
+
+
 def test_an_error_of_nan_stops_before_it_does_harm(simulated, tmp_path):
     trainer = LooseTrainer(CONFIG, BODY, CLOTH, simulated, tmp_path)
-    trainer.data[3] = trainer.data[3] * torch.nan
+    trainer.loss.goals[:] = torch.nan
     before = [p.clone() for p in trainer.parameters]
     with pytest.raises(FloatingPointError, match="step 0 is not finite"):
         trainer.step()

@@ -1,8 +1,12 @@
 """Cloth falls, hangs, lies and slides as it should, twice to the same bit."""
 
 import json
+import os
+import subprocess
 import sys
+import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,10 +23,12 @@ from skinlib.garments.motion import Motion
 from skinlib.garments.simulation import (
     Simulation,
     SimulationConfig,
+    check_simulated,
     colour_pairs,
     inside,
     obstacle,
     predictability,
+    quiet,
     read_simulated,
     rms,
     root_frame,
@@ -273,6 +279,43 @@ def test_two_processes_make_what_one_makes(job, tmp_path):
     assert [p.read_bytes() for p in one] == [p.read_bytes() for p in two]
 
 
+POOL = """
+import os, time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from skinlib.garments.simulation import _end_with_parent
+
+if __name__ == "__main__":
+    with ProcessPoolExecutor(1, get_context("spawn"), _end_with_parent) as pool:
+        print(pool.submit(os.getpid).result(), flush=True)
+        time.sleep(60)
+"""
+
+
+def test_workers_end_with_a_killed_command(tmp_path):
+    script = tmp_path / "pool.py"
+    script.write_text(POOL)
+    with subprocess.Popen(
+        [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as command:
+        worker = Path("/proc", command.stdout.readline().decode().strip())
+        if not worker.exists():
+            pytest.skip("there is no /proc to look into")
+        command.kill()
+    end = time.monotonic() + 20
+    while worker.exists() and time.monotonic() < end:
+        time.sleep(0.1)
+    assert not worker.exists()
+
+
+def test_a_motion_that_does_not_fit_leaves_nothing_behind(job, tmp_path):
+    garment, head, motions, config = job
+    other = Motion.create(np.zeros((3, 1, 3)), ["alone"])
+    with pytest.raises(HeadError, match="the motion has 'alone'"):
+        simulate_motions(garment, head, [*motions, other], tmp_path / "new", config)
+    assert not (tmp_path / "new").exists()
+
+
 def test_a_folder_holds_one_data_set(job, tmp_path):
     garment, head, motions, config = job
     motions = motions[2:]
@@ -294,6 +337,24 @@ def test_a_folder_holds_one_data_set(job, tmp_path):
 
 
 # --- measures -------------------------------------------------------------------------
+
+
+def test_simulations_of_another_garment_or_body_are_not_taken(job, tmp_path):
+    garment, head, motions, config = job
+    simulate_motions(garment, head, motions[2:], tmp_path, config)
+    check_simulated(tmp_path, garment, head)
+    with pytest.raises(HeadError, match="garment: it is another one"):
+        check_simulated(tmp_path, sleeve(0.115, pinned=False), head)
+    taller = Head.create(
+        head.vertices * 1.01, head.faces, head.skeleton, weights=head.weights
+    )
+    with pytest.raises(HeadError, match="body: it is another one"):
+        check_simulated(tmp_path, garment, taller)
+    (tmp_path / "simulation.json").write_text("[")
+    with pytest.raises(HeadError, match="simulation: it cannot be read"):
+        check_simulated(tmp_path, garment, head)
+    (tmp_path / "simulation.json").unlink()
+    check_simulated(tmp_path, garment, taller)  # by another simulator
 
 
 def test_strain_of_known_lengths():
@@ -368,3 +429,14 @@ def test_without_warp_it_says_what_to_install(head, monkeypatch):
     simulation._kernels.cache_clear()
     with pytest.raises(HeadError, match="pip install warp-lang"):
         simulate(sheet(), head, still(2), AT_ONCE)
+
+
+def test_quiet_hides_what_native_code_says(capfd):
+    with quiet():
+        os.write(2, b"nobody hears this")
+    os.write(2, b"but this")
+    assert capfd.readouterr().err == "but this"
+    with pytest.raises(KeyError), quiet():
+        raise KeyError
+    os.write(2, b"and this")
+    assert capfd.readouterr().err == "and this"

@@ -23,10 +23,18 @@ from torch import Tensor, nn
 from skinlib.animation import AnimatedMesh, write_animation
 from skinlib.garments.binding import closest_point_weights, smooth
 from skinlib.garments.body import Body, read_body, write_body
+from skinlib.garments.collision import nearest, take
+from skinlib.garments.energies import collision_energy
+from skinlib.garments.fitting import SkinningError
 from skinlib.garments.garment import Garment, read_garment, write_garment
 from skinlib.garments.motion import Motion, training_motions, walk
 from skinlib.garments.outfit import BODY, CLOTH_COLOURS, FRAMES, SKIN_COLOUR
-from skinlib.garments.simulation import Simulated, read_simulated, root_frame
+from skinlib.garments.simulation import (
+    Simulated,
+    obstacle,
+    read_simulated,
+    root_frame,
+)
 from skinlib.garments.virtual_bones import (
     KERNELS,
     LEAST_TOTAL,
@@ -47,7 +55,6 @@ from skinlib.garments.virtual_bones import (
     prune_joints,
     virtual_bind,
 )
-from skinlib.geometry import mesh_edges
 from skinlib.head import HeadError, Skeleton
 from skinlib.skinning import linear_blend_skinning
 from skinlib.training.checkpoint import (
@@ -128,15 +135,19 @@ class LooseConfig:
     alpha: float | None = None  # metres that heat reaches; None: as bones are apart
     kernel: str = KERNELS[0]
     hybrid: bool = True  # joints move what is tight; else virtual bones move all
+    carry: bool = True  # joints carry the virtual bones; else the root alone does
     threshold: float = THRESHOLD  # metres off, from where a vertex is loose
     slope: float = SLOPE  # per metre: from there to loose altogether
     reduce: str = "mean"  # over the frames, or "p90"
     least: float = LEAST_TOTAL  # vertices that a joint moves, or it is left out
-    steps: int = 800
+    steps: int = 1600
     batch: int = 8  # windows a step
     window: int = 32  # frames
     unscored: int = 8  # of them: the memory begins with nothing
     edges: float = 10.0  # weight of the errors of edges, beside those of vertices
+    collision: float = 30.0  # and of what is under the skin of the body
+    gap: float = 0.004  # metres that cloth keeps from the skin
+    touched: int = 4  # frames a step in which collisions are looked for
     learning_rate: float = 2e-3  # falls to 1 % along a cosine
     seed: int = 0  # of bones, parameters and windows
     threads: int = 2  # another number, other last bits
@@ -145,9 +156,11 @@ class LooseConfig:
     network: VirtualBonesConfig = field(default_factory=VirtualBonesConfig)
 
     def __post_init__(self):
-        for name, least in (("steps", 1), ("batch", 1), ("window", 1), ("unscored", 0)):
-            if getattr(self, name) < least:
-                fix = f"give {least} or more"
+        ones = dict.fromkeys(("steps", "batch", "window", "touched"), 1)
+        zeros = dict.fromkeys(("unscored", "edges", "collision", "gap"), 0)
+        for name, least in (ones | zeros).items():
+            if not least <= getattr(self, name) < np.inf:
+                fix = f"give a number of {least} or more"
                 raise HeadError(name, f"it is {getattr(self, name)}", fix)
         if self.unscored >= self.window:
             raise HeadError(
@@ -226,11 +239,12 @@ class LooseGarment:
         skeleton, count = self.body.head.skeleton, len(self.bones)
         local = in_root_frame(transforms)
         found = (
-            pose_features(transforms, skeleton, self.read, fps, before),
+            pose_features(transforms, skeleton, self.read, fps, before, local=local),
             carriers(local, self.carried, self.points[:count]),
             local[:, self.joints] @ self._binds,
         )
-        return Inputs(*(torch.tensor(part, dtype=torch.float32) for part in found))
+        arrays = (part.astype(np.float32, copy=False) for part in found)
+        return Inputs(*map(torch.from_numpy, arrays))
 
     def pose(self, motion: Motion) -> np.ndarray:
         """(T, V, 3) float32 the garment in each frame of a motion.
@@ -349,15 +363,7 @@ def bind(
     """
     rest = _checked_rest(body, garment, simulated)
     skeleton = body.head.skeleton
-    bones = place_bones(rest, garment.faces, config.bones, config.seed)
-    distances = bone_distances(rest, garment.faces, bones)
-    alpha = config.alpha
-    if alpha is None:
-        alpha = bone_spacing(distances, bones)
-    shares = fading_heat if config.fade else heat_weights
-    heat = shares(distances, alpha, config.influences, config.kernel)
     nearest = joint_weights(garment, rest, body)
-
     every = max(1, sum(len(s.motion) for s in simulated) // LOOKED_AT)
     seen, skinned, drape = [], [], np.zeros(rest.shape)
     for motion, posed, _ in simulated:
@@ -370,12 +376,24 @@ def bind(
     loose = np.ones(len(rest), np.float32)
     if config.hybrid:
         loose = looseness(skinned, seen, config.threshold, config.slope, config.reduce)
+
+    around = _loose_faces(garment.faces, loose, config.bones)
+    bones = place_bones(rest, around, config.bones, config.seed)
+    distances = bone_distances(rest, garment.faces, bones)
+    alpha = config.alpha
+    if alpha is None:
+        alpha = bone_spacing(distances, bones)
+    shares = fading_heat if config.fade else heat_weights
+    heat = shares(distances, alpha, config.influences, config.kernel)
     _, read = prune_joints(nearest, config.least)
     weights = hybrid_weights(loose, heat, nearest)
     weights, columns = prune_joints(weights, config.least, len(bones))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         network = VirtualBonesNet(9 * len(read) + 9, len(bones), config.network)
+    carried = smooth(nearest, garment.faces, CARRIED)[bones]
+    if not config.carry:
+        carried = np.eye(1, len(skeleton), dtype=np.float32).repeat(len(bones), axis=0)
     return LooseGarment(
         body=body,
         garment=garment,
@@ -386,8 +404,17 @@ def bind(
         weights=weights,
         joints=columns[len(bones) :] - len(bones),
         read=read,
-        carried=smooth(nearest, garment.faces, CARRIED)[bones],
+        carried=carried,
     )
+
+
+def _loose_faces(faces: np.ndarray, loose: np.ndarray, count: int) -> np.ndarray:
+    """(G, 3) those on which `count` virtual bones are of use: joints hold the others.
+
+    All of them, where too little of a garment is loose.
+    """
+    found = faces[(loose[faces] > 0.5).all(axis=1)]
+    return found if len(np.unique(found)) >= count else faces
 
 
 def fading_heat(
@@ -508,17 +535,22 @@ class LooseTrainer(Run):
                 for end, length in zip(ends, lengths, strict=True)
             ]
         )
-        device = config.device
-        parts = []
+        device, parts, truth, bodies = config.device, [], [], []
         for motion, posed, _ in simulated:
             transforms = motion.transforms(body.head.skeleton)
-            local = torch.from_numpy(root_frame(posed, transforms[:, 0]))
-            parts.append((*self.garment.inputs(transforms, motion.fps), local))
+            parts.append(self.garment.inputs(transforms, motion.fps))
+            truth.append(root_frame(posed, transforms[:, 0]))
+            bodies.append(in_root_frame(transforms).astype(np.float32))
         self.data = [torch.cat(kind).to(device) for kind in zip(*parts, strict=True)]
+        given = self.garment.rest, self.garment.weights, garment.faces
+        truth = np.concatenate(truth)
+        self.error = SkinningError(*given, truth).to(device)
+        self.loss = SkinningError(*given, truth, config.edges).to(device)
         self.garment.network.standardise(self.data[0].cpu())
         self.network = self.garment.network.to(device)
         self.tensors = [part.to(device) for part in self.garment._tensors]
-        self.edges = torch.from_numpy(mesh_edges(garment.faces).T.copy()).to(device)
+        self.obstacle = obstacle(garment, body.head).to(device)
+        self.body = torch.from_numpy(np.concatenate(bodies)).to(device)
         self._start(config, out, [{"params": list(self.network.parameters())}])
 
     def step(self) -> dict[str, float]:
@@ -527,18 +559,20 @@ class LooseTrainer(Run):
         rng = np.random.default_rng((config.seed, 2, self.steps_done))
         starts = rng.choice(self.starts, config.batch)
         frames = torch.from_numpy(starts[:, None] + np.arange(config.window))
-        features, carrier, joints, truth = (
-            part[frames.to(part.device)] for part in self.data
-        )
-        rest, weights, offsets = self.tensors
+        features, carrier, joints = (part[frames.to(part.device)] for part in self.data)
         placed = torch.cat([self.network(features, carrier), joints], dim=2)
         scored = slice(config.unscored, None)
-        posed = hybrid_skinning(rest, weights, placed[:, scored], offsets)
-        off = posed - truth[:, scored]
-        error = off.square().sum(-1).mean()
-        a, b = self.edges  # the error of a vertex does not tell whether cloth is torn
-        torn = (off[..., a, :] - off[..., b, :]).square().sum(-1).mean()
-        loss = error + config.edges * torn
+        placed, frames = placed[:, scored], frames[:, scored]
+        moved = placed @ self.tensors[2]
+        with torch.no_grad():
+            error = self.error(moved, frames).mean()
+        # The error of a vertex does not tell whether cloth is torn; edges do.
+        loss = self.loss(moved, frames).mean()
+        if config.collision:
+            late = rng.integers(config.window - config.unscored, size=config.touched)
+            some = np.arange(config.touched) % config.batch, late
+            pressed = self._collision(placed[some], frames[some])
+            loss = loss + config.collision * pressed
         self.optimizer.zero_grad()
         loss.backward()
         if not torch.isfinite(loss):
@@ -550,6 +584,20 @@ class LooseTrainer(Run):
         told = {"mm": 1000 * error.item() ** 0.5}
         self._update(told)
         return told
+
+    def _collision(self, placed: Tensor, frames: Tensor) -> Tensor:
+        """m^2, mean over vertices, see `collision_energy`.
+
+        Args:
+            placed: (B, C, 4, 4) in the frame of the root. frames: (B,).
+        """
+        rest, weights, offsets = self.tensors
+        posed = hybrid_skinning(rest, weights, placed, offsets)
+        with torch.no_grad():
+            skin, normals = self.obstacle.pose(self.body[frames])
+        under = nearest(posed, skin)
+        near = take(skin, under), take(normals, under)
+        return collision_energy(posed, *near, self.config.gap).mean() / len(rest)
 
     def _finish(self) -> nn.Module:
         self.network.cpu().eval()

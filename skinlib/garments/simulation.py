@@ -17,12 +17,15 @@ Symbols: T frames, V garment vertices, B body vertices, J bones.
 """
 
 import json
+import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cache
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
+from threading import Thread
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -375,6 +378,19 @@ class Simulator:
         return wp.array(values, dtype=wp.vec3, device=self.device)
 
 
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Without what native code writes to stderr, past Python: Warp misses a GPU."""
+    kept, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(sink)
+
+
 @cache
 def _kernels() -> SimpleNamespace:
     """Warp's kernels; compiled once, which takes some seconds, and then read from disk.
@@ -391,7 +407,8 @@ def _kernels() -> SimpleNamespace:
             "run `pip install warp-lang`",
         ) from error
     level, wp.config.log_level = wp.config.log_level, wp.LOG_ERROR
-    wp.init()  # else it writes what devices there are
+    with quiet():
+        wp.init()  # else it writes what devices there are
     wp.config.log_level = max(level, wp.LOG_WARNING)
     gravity = wp.constant(GRAVITY)
 
@@ -696,10 +713,11 @@ def simulate_motions(
     """
     config, out = config or SimulationConfig(), Path(out)
     paths = [out / f"motion_{number:04d}.npz" for number in range(len(motions))]
+    for motion in motions:
+        motion.transforms(head.skeleton)  # rather now than after an hour
     _begin(out, garment, head, config)
     missing = []
     for motion, path in zip(motions, paths, strict=True):
-        motion.transforms(head.skeleton)  # rather now than after an hour
         if path.exists():
             _check_same(motion, path)
         else:
@@ -716,7 +734,8 @@ def simulate_motions(
                 bar.update()
             return paths
         # A forked process could not use CUDA.
-        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        context = get_context("spawn")
+        with ProcessPoolExecutor(workers, context, _end_with_parent) as pool:
             job = garment, head, config, device, rest
             pending = [pool.submit(_simulate_to, *job, *pair) for pair in missing]
             try:
@@ -767,6 +786,16 @@ def read_simulated(path: str | Path) -> Simulated:
     return Simulated(motion, posed.astype(np.float32), rest.astype(np.float32))
 
 
+def _end_with_parent() -> None:
+    """A process of a pool would wait for ever when the command has been killed."""
+
+    def watch():
+        parent_process().join()
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()
+
+
 def _simulate_to(garment, head, config, device, rest, motion, path) -> None:
     _write(path, motion, Simulator(garment, head, config, device), rest)
 
@@ -792,16 +821,7 @@ def _begin(out: Path, garment: Garment, head: Head, config: SimulationConfig) ->
     Raises:
         HeadError: something else is.
     """
-    arrays = {
-        "garment": (garment.vertices, garment.faces, garment.pinned),
-        "body": (head.vertices, head.faces, head.weights, head.skeleton.joints),
-    }
-    meshes = {
-        name: crc32(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
-        for name, parts in arrays.items()
-        if all(part is not None for part in parts)
-    }
-    run = json.loads(json.dumps(asdict(config) | meshes))
+    run = json.loads(json.dumps(asdict(config) | _checksums(garment, head)))
     path = out / RUN
     if not path.exists():
         try:
@@ -815,12 +835,7 @@ def _begin(out: Path, garment: Garment, head: Head, config: SimulationConfig) ->
             ) from error
         replace_file(path, f"{json.dumps(run, indent=1)}\n".encode())
         return
-    try:
-        before = dict(json.loads(path.read_bytes()))
-    except (OSError, ValueError, TypeError) as error:
-        raise HeadError(
-            "simulation", "it cannot be read", "choose a new folder", path
-        ) from error
+    before = _begun(path)
     differs = [key for key in run if before.get(key) != run[key]]
     if differs:
         raise HeadError(
@@ -829,6 +844,50 @@ def _begin(out: Path, garment: Garment, head: Head, config: SimulationConfig) ->
             "continue it with the arguments it was begun with, or choose a new folder",
             out,
         )
+
+
+def check_simulated(folder: str | Path, garment: Garment, head: Head) -> None:
+    """Make sure that `simulate_motions` filled a folder with this garment and body.
+
+    A folder that it has not begun, as of another simulator, may hold anything.
+
+    Raises:
+        HeadError: it was another one.
+    """
+    path = Path(folder) / RUN
+    if not path.exists():
+        return
+    before = _begun(path)
+    for name, checksum in _checksums(garment, head).items():
+        if before.get(name) != checksum:
+            raise HeadError(
+                name,
+                "it is another one than in the simulation",
+                "give the mesh, the pins and the body that were simulated",
+                path,
+            )
+
+
+def _begun(path: Path) -> dict:
+    """What `_begin` noted."""
+    try:
+        return dict(json.loads(path.read_bytes()))
+    except (OSError, ValueError, TypeError) as error:
+        raise HeadError(
+            "simulation", "it cannot be read", "choose a new folder", path
+        ) from error
+
+
+def _checksums(garment: Garment, head: Head) -> dict[str, int]:
+    arrays = {
+        "garment": (garment.vertices, garment.faces, garment.pinned),
+        "body": (head.vertices, head.faces, head.weights, head.skeleton.joints),
+    }
+    return {
+        name: crc32(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
+        for name, parts in arrays.items()
+        if all(part is not None for part in parts)
+    }
 
 
 def _check_same(motion: Motion, path: Path) -> None:

@@ -7,7 +7,6 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 
-import ipywidgets
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
@@ -33,7 +32,7 @@ from skinlib.views import scenes
 from skinlib.views.picture import FAINT, ColourBar, Picture, new_figure, picture_grid
 from skinlib.views.picture import rasterise as rasterised
 from skinlib.views.plots import SERIES
-from skinlib.views.widgets import SliderLab, slider_lab
+from skinlib.views.widgets import SliderLab, playable, slider_lab
 
 SKIN = (0.87, 0.74, 0.65)
 CLOTHS = ((0.36, 0.55, 0.72), (0.72, 0.42, 0.36), (0.65, 0.6, 0.42))
@@ -290,12 +289,8 @@ def playback(
         bar = colour_bar(paint)
         return grid([image], [f"frame {frame}"], colour_bar=bar)
 
-    last = len(motion) - 1
-    lab = slider_lab(show, frame=(0, last), paint=["cloth", *PAINTS])
-    play = ipywidgets.Play(max=last, step=max(1, round(motion.fps / 10)), interval=300)
-    ipywidgets.link((play, "value"), (lab.controls["frame"], "value"))
-    lab.children = (play, *lab.children)
-    return lab
+    lab = slider_lab(show, frame=(0, len(motion) - 1), paint=["cloth", *PAINTS])
+    return playable(lab, motion.fps)
 
 
 # ---- the energies at work on one pose

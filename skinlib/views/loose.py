@@ -3,13 +3,10 @@
 Symbols: T frames, V vertices of the garment, N virtual bones.
 """
 
-import contextlib
 import functools
-import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import ipywidgets
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
@@ -40,7 +37,7 @@ from skinlib.views import garments, scenes
 from skinlib.views.picture import FAINT, ColourBar, Picture, new_figure
 from skinlib.views.picture import rasterise as rasterised
 from skinlib.views.plots import OURS, SERIES
-from skinlib.views.widgets import SliderLab, slider_lab
+from skinlib.views.widgets import SliderLab, playable, slider_lab
 
 LOWER = scenes.View(30.0, 6.0, zoom=1.9, centre=(0.0, 0.0, -0.13), upright=True)
 TILE = (250, 260)
@@ -303,25 +300,11 @@ def periodic(
     """
     period = round(fps)
     motion = walk(head.skeleton, cycles + 2, speed=1.0, stride=30, fps=fps)
-    with quiet():
-        simulator = Simulator(garment, head, SimulationConfig(smoothing=smoothing))
+    simulator = Simulator(garment, head, SimulationConfig(smoothing=smoothing))
     frames = simulator.frames(motion, simulator.settled())
     posed = np.stack(list(frames))[2 * period :]
     found = predictability(posed, period)
     return posed.reshape(cycles, period, *posed.shape[1:]), found
-
-
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Without what native code writes to stderr, past Python: Warp misses a GPU."""
-    kept, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(sink, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(sink)
 
 
 def cycles_plot(
@@ -404,18 +387,14 @@ def playback(
     outfit: Outfit, motion: Motion, ways: Mapping[str, np.ndarray], **start
 ) -> SliderLab:
     """A motion to play and to stop, moved in several ways side by side."""
-    last = len(motion) - 1
     lab = slider_lab(
         functools.partial(frame_picture, outfit, motion, ways, size=(180, 220)),
         start={"view_from": 30.0} | start,
-        frame=(0, last),
+        frame=(0, len(motion) - 1),
         paint=["cloth", "error"],
         view_from=(-180.0, 180.0, 5.0),
     )
-    play = ipywidgets.Play(max=last, step=max(1, round(motion.fps / 8)), interval=300)
-    ipywidgets.link((play, "value"), (lab.controls["frame"], "value"))
-    lab.children = (play, *lab.children)
-    return lab
+    return playable(lab, motion.fps)
 
 
 def strip(

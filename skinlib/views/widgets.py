@@ -136,6 +136,19 @@ def slider_lab(
     return SliderLab(function, controls, run_button)
 
 
+def playable(lab: SliderLab, fps: float) -> SliderLab:
+    """The same lab with a button that plays its slider `frame`, in slow motion.
+
+    Args:
+        fps: frames per second of the motion.
+    """
+    frame = lab.controls["frame"]
+    play = ipywidgets.Play(max=frame.max, step=max(1, round(fps / 8)), interval=300)
+    ipywidgets.link((play, "value"), (frame, "value"))
+    lab.children = (play, *lab.children)
+    return lab
+
+
 def _control(name: str, spread, value) -> ipywidgets.Widget:
     common = {
         "description": name.replace("_", " "),
