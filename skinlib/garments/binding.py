@@ -133,9 +133,10 @@ def check_fit(garment: Garment, head: Head) -> np.ndarray:
     areas = np.linalg.norm(normals, axis=1)
     share = float(areas[away].sum() / areas.sum())
     if share > 0.5:
+        name = garment.name or "the garment"
         raise HeadError(
             "faces",
-            f"{share:.0%} of the garment shows its outside to the skin",
+            f"{share:.0%} of {name} shows its outside to the skin",
             "turn its faces round (flip the normals)",
         )
     return distance

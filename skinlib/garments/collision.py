@@ -10,11 +10,9 @@ from torch import Tensor, nn
 from skinlib.head import Head
 from skinlib.skinning import linear_blend_skinning
 
-REACH = 0.1
-"""Metres: body vertices further from the garment at rest are no obstacle there."""
-
-TOUCH = 0.03
-"""Metres: the same for the skinned garment in any pose."""
+REACH, NEAR = 0.25, 0.1
+"""Metres: body vertices further from a loose garment at rest are no obstacle; and of a
+tight one, unless they come near in a pose."""
 
 
 class Collider(nn.Module):
@@ -64,7 +62,7 @@ def reached(
     points: np.ndarray,
     weights: np.ndarray,
     transforms: np.ndarray,
-    reach: float = TOUCH,
+    reach: float,
 ) -> np.ndarray:
     """(C,) ids of the body's vertices that come near cloth in one of T poses.
 

@@ -18,6 +18,7 @@ import igl
 import numpy as np
 import torch
 from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
 from tqdm.auto import tqdm
 
 from skinlib import geometry
@@ -161,10 +162,13 @@ def inside_out(
     close = squared < CLOSE**2
     away = close & ((normals * outwards[found]).sum(-1) < 0)
     shared = np.minimum(moved_by, skin_moved_by[found]).sum(-1)
-    low, high = body[faces].min(axis=1) - CLOSE, body[faces].max(axis=1) + CLOSE
-    for i in np.flatnonzero(close & (shared < TOGETHER)):
+    doubtful = np.flatnonzero(close & (shared < TOGETHER))
+    middles = body[faces].mean(axis=1)
+    size = np.linalg.norm(body[faces] - middles[:, None], axis=-1).max()
+    around = cKDTree(middles).query_ball_point(centres[doubtful], CLOSE + size)
+    for i, own in zip(doubtful, around, strict=True):
         # Other skin is nearer: look again, at its own alone.
-        own = np.flatnonzero(((low < centres[i]) & (centres[i] < high)).all(axis=1))
+        own = np.array(own, np.int64)
         own = own[np.minimum(moved_by[i], skin_moved_by[own]).sum(-1) >= TOGETHER]
         away[i] = False
         if len(own):

@@ -20,7 +20,7 @@ from skinlib.garments.binding import (
     smooth,
 )
 from skinlib.garments.body import Body, read_body, write_body
-from skinlib.garments.collision import Collider, near, reached
+from skinlib.garments.collision import NEAR, Collider, near, reached
 from skinlib.garments.energies import Cloth
 from skinlib.garments.garment import Garment, read_garment, write_garment
 from skinlib.garments.motion import Motion
@@ -162,17 +162,20 @@ class Outfit:
         """The part of the body that the garments can touch at rest."""
         return Collider(self.body.head, near(self.body.head, self.vertices))
 
-    def collider_in(self, motion: Motion, smoothing: int) -> Collider:
+    def collider_in(self, motion: Motion, smoothing: int, touch: float) -> Collider:
         """The part that they can touch at rest or in one of the poses.
 
         Args:
             smoothing: of the blend weights that move them meanwhile.
+            touch: metres within which what is skinned so is touched; 0 for `collider`.
         """
+        if not touch:
+            return self.collider
         head, some = self.body.head, LOOKED_AT
         transforms = motion.transforms(head.skeleton)[:some]
         weights = self.blend_weights(smoothing)
-        touched = reached(head, self.vertices, weights, transforms)
-        return Collider(head, np.union1d(touched, near(head, self.vertices)))
+        touched = reached(head, self.vertices, weights, transforms, touch)
+        return Collider(head, np.union1d(touched, near(head, self.vertices, NEAR)))
 
     @cached_property
     def overlaps(self) -> list[tuple[slice, slice, np.ndarray]]:

@@ -61,6 +61,9 @@ class GarmentConfig:
     weights_rate: float = 10.0  # times that for learnt blend weights
     smoothing: int = 10  # of the blend weights; 50 for a skirt
     epsilon: float = 0.004  # metres that the cloth keeps from the body, and layers
+    # Metres: what comes nearer in a pose is an obstacle, such as a hand. 0: what is near
+    # at rest, for a skirt: hands go into it in many poses, and it cannot evade them all.
+    touch: float = 0.03
     shapes: bool = False  # learn the shapes of the body and looser cuts, too
     seed: int = 0  # of parameters, poses and their order
     threads: int = 2  # another number, other last bits
@@ -282,12 +285,12 @@ class Trainer(Run):
         if poses is None:
             poses = self._random_poses()
         device = config.device
-        collider = outfit.collider_in(poses, config.smoothing)
+        collider = outfit.collider_in(poses, config.smoothing, config.touch)
         self.network = outfit.network(
             config.network, config.smoothing, config.shapes, config.seed, collider
         ).to(device)
         self.cloth = copy.deepcopy(outfit.cloth).to(device)
-        self.collider = collider.to(device)
+        self.collider = copy.deepcopy(collider).to(device)
         self.pinned = torch.from_numpy(outfit.pinned).to(device)
         self._draw(poses)
         parameters, change = self.network.parameters(), self.network.weight_change
