@@ -61,8 +61,8 @@ class GarmentConfig:
     weights_rate: float = 10.0  # times that for learnt blend weights
     smoothing: int = 10  # of the blend weights; 50 for a skirt
     epsilon: float = 0.004  # metres that the cloth keeps from the body, and layers
-    # Metres: what comes nearer in a pose is an obstacle, such as a hand. 0: what is near
-    # at rest, for a skirt: hands go into it in many poses, and it cannot evade them all.
+    # Metres: what comes so near in a pose is an obstacle, such as a hand. 0: what is
+    # near at rest; hands go into a skirt in many poses, and it cannot evade them all.
     touch: float = 0.03
     shapes: bool = False  # learn the shapes of the body and looser cuts, too
     seed: int = 0  # of parameters, poses and their order
