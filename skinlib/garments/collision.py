@@ -21,10 +21,15 @@ class Collider(nn.Module):
     Attributes:
         points: (C, 3) rest positions. weights: (C, J). faces: (F, 3) ids of points.
         vertices: (C,) their ids in the body.
+        kept: (K,) which of them are an obstacle; the others are there for the normals.
     """
 
-    def __init__(self, head: Head, vertices: np.ndarray):
-        """Take the body's vertices with the ids `vertices` (C,)."""
+    def __init__(self, head: Head, vertices: np.ndarray, spacing: float = 0.0):
+        """Take the body's vertices with the ids `vertices` (C,).
+
+        Args:
+            spacing: metres; of vertices that are closer, one is enough of an obstacle.
+        """
         super().__init__()
         place = np.full(len(head.vertices), -1)
         place[vertices] = np.arange(len(vertices))
@@ -34,18 +39,21 @@ class Collider(nn.Module):
         self.register_buffer("points", torch.tensor(head.vertices[vertices]))
         self.register_buffer("weights", torch.tensor(head.weights[vertices]))
         self.register_buffer("faces", torch.tensor(faces))
+        kept = thinned(head.vertices[vertices], spacing)
+        self.register_buffer("kept", torch.tensor(kept))
 
     def pose(
         self, transforms: Tensor, offsets: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Posed points and their unit normals, (B, C, 3) each.
+        """Posed points of the obstacle and their unit normals, (B, K, 3) each.
 
         Args:
             transforms: (B, J, 4, 4). offsets: (B, C, 3), what the body's shape adds.
         """
         points = self.points if offsets is None else self.points + offsets
         posed = linear_blend_skinning(points, self.weights, transforms)
-        return posed, vertex_normals(posed, self.faces)
+        normals = vertex_normals(posed, self.faces)
+        return posed.index_select(1, self.kept), normals.index_select(1, self.kept)
 
 
 def near(head: Head, points: np.ndarray, reach: float = REACH) -> np.ndarray:
@@ -55,6 +63,25 @@ def near(head: Head, points: np.ndarray, reach: float = REACH) -> np.ndarray:
     """
     distance, _ = cKDTree(points).query(head.vertices)
     return np.flatnonzero((distance < reach) | (distance.min() >= reach))
+
+
+def thinned(points: np.ndarray, spacing: float) -> np.ndarray:
+    """(K,) ids of points (C, 3), none of which is closer than `spacing` to another.
+
+    The first one of a cluster stays.
+
+    >>> thinned(np.array([[0, 0, 0], [1, 0, 0], [1.5, 0, 0], [9, 0, 0]]), 1.2).tolist()
+    [0, 2, 3]
+    """
+    if not spacing:
+        return np.arange(len(points))
+    around = cKDTree(points).query_ball_point(points, spacing)
+    left = np.ones(len(points), bool)
+    for i, others in enumerate(around):
+        if left[i]:
+            left[others] = False
+            left[i] = True
+    return np.flatnonzero(left)
 
 
 def reached(

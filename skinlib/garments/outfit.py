@@ -41,8 +41,9 @@ CARRIED = 20  # rounds of smoothing of what the body's shapes do to the cloth
 MOVES = 0.5
 """A bone counts when the weights it has add up to more than half a vertex."""
 
-LOOKED_AT = 1000
-"""Poses in which we look what a garment touches: two seconds."""
+LOOKED_AT, SPACING = 2000, 0.008
+"""Poses in which we look what a garment touches: a few seconds; and metres between the
+points of that: fingers are modelled finer than cloth can feel."""
 
 EASE_RANGE = (-0.05, 0.1)
 """By how much cloth is cut wider in training with shapes."""
@@ -171,11 +172,12 @@ class Outfit:
         """
         if not touch:
             return self.collider
-        head, some = self.body.head, LOOKED_AT
-        transforms = motion.transforms(head.skeleton)[:some]
+        head, step = self.body.head, -(-len(motion) // LOOKED_AT)
+        transforms = motion.transforms(head.skeleton)[::step]
         weights = self.blend_weights(smoothing)
         touched = reached(head, self.vertices, weights, transforms, touch)
-        return Collider(head, np.union1d(touched, near(head, self.vertices, NEAR)))
+        everything = np.union1d(touched, near(head, self.vertices, NEAR))
+        return Collider(head, everything, SPACING)
 
     @cached_property
     def overlaps(self) -> list[tuple[slice, slice, np.ndarray]]:

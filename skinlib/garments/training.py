@@ -63,7 +63,7 @@ class GarmentConfig:
     epsilon: float = 0.004  # metres that the cloth keeps from the body, and layers
     # Metres: what comes so near in a pose is an obstacle, such as a hand. 0: what is
     # near at rest; hands go into a skirt in many poses, and it cannot evade them all.
-    touch: float = 0.03
+    touch: float = 0.06
     shapes: bool = False  # learn the shapes of the body and looser cuts, too
     seed: int = 0  # of parameters, poses and their order
     threads: int = 2  # another number, other last bits
