@@ -441,7 +441,7 @@ def garment_train(
         meshes: The garments.
         out: Folder that all is written to; made when there is none.
         body: Skinned body (.npz, see data_samples/README.md); else the shipped one.
-        poses: Motion (.npz) with the poses to learn; else 4,000 drawn at random.
+        poses: Motion (.npz) with the poses to learn; else 8,000 random ones, mirrored.
         simulated: What `skinlib garment simulate` wrote of this garment.
         bones: How many virtual bones then move it.
         pin_top: Hold the garment at its highest opening, as a skirt at the waist.
@@ -480,11 +480,13 @@ def garment_train(
         same = {"seed": seed, "device": _device(device), "threads": threads}
         _train_loose(outfit, simulated, out, bones=bones, steps=steps, **same)
         return
+    hangs = bool(outfit.pinned.any())
     if smooth is None:
-        smooth = 50 if outfit.pinned.any() else 10
+        smooth = 50 if hangs else 10
     config = GarmentConfig(
         steps=10_000 if steps is None else steps,
         smoothing=smooth,
+        touch=0.0 if hangs else GarmentConfig.touch,
         shapes=shapes,
         seed=seed,
         device=_device(device),

@@ -105,6 +105,20 @@ def test_a_garment_inside_the_body_is_refused():
         check_fit(moved(SHIRT, scale=0.8, by=(0, 0, 0.09)), BODY)
 
 
+def test_a_garment_of_a_millimetre_is_refused():
+    """At the origin, between the legs, it is neither far away nor inside."""
+    with pytest.raises(
+        HeadError, match=r"the garment measures 0\.000\d+ x .*its scale"
+    ):
+        check_fit(moved(SHIRT, scale=0.001), BODY)
+
+
+def test_a_garment_inside_out_is_refused():
+    turned = Garment.create(SHIRT.vertices, SHIRT.faces[:, ::-1])
+    with pytest.raises(HeadError, match=r"\d+% of the garment shows its outside"):
+        check_fit(turned, BODY)
+
+
 def test_layers_that_intersect_or_are_swapped_are_refused():
     assert layers_apart(flat_sheet(0), flat_sheet(0.1)) == 0
     with pytest.raises(HeadError, match=r"1 of 5 vertices of sheet 0 .*outwards"):

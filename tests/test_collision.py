@@ -6,7 +6,15 @@ import torch
 from test_body import SIDES, bends, sleeve, small_body
 
 from skinlib import geometry
-from skinlib.garments.collision import Collider, near, nearest, take, vertex_normals
+from skinlib.garments.collision import (
+    Collider,
+    near,
+    nearest,
+    reached,
+    take,
+    thinned,
+    vertex_normals,
+)
 from skinlib.skinning import linear_blend_skinning
 
 
@@ -124,6 +132,39 @@ def test_a_collider_keeps_the_faces_whose_corners_it_has(head, whole):
     assert torch.equal(part.weights, whole.weights[ring])
     kept = {tuple(face) for face in ring[part.faces].tolist()}
     assert kept == {tuple(f) for f in head.faces.tolist() if np.isin(f, ring).all()}
+
+
+def test_reached_is_what_comes_near_in_some_pose(head):
+    """The post and a point beside it, on a bone of its own that is carried along."""
+    bones = np.tile(np.eye(4, dtype=np.float32), (2, 3, 1, 1))
+    bones[1, 0, 2, 3] = 0.3  # in the second pose bone 0 is 30 cm higher
+    still = head.replace(weights=np.eye(3)[np.ones(len(head.vertices), int)])
+    point, moves = np.array([[0.12, 0, 0.2]], np.float32), np.eye(3)[:1]
+    heights = [
+        np.unique(still.vertices[reached(still, point, moves, bones[:n], 0.04), 2])
+        for n in (1, 2)
+    ]
+    assert heights[0] == pytest.approx([0.2])
+    assert heights[1] == pytest.approx([0.2, 0.5])
+    assert len(reached(still, point + 9, moves, bones, 0.04)) == 0
+
+
+def test_a_thinned_cloud_covers_what_it_was():
+    points = np.random.default_rng(0).uniform(size=(300, 3))
+    kept = thinned(points, 0.2)
+    apart = np.linalg.norm(points[kept][:, None] - points[kept], axis=-1)
+    assert apart[~np.eye(len(kept), dtype=bool)].min() > 0.2
+    covered = np.linalg.norm(points[:, None] - points[kept], axis=-1).min(axis=1)
+    assert covered.max() <= 0.2 and 10 < len(kept) < 200
+    assert np.array_equal(thinned(points, 0.0), np.arange(300))
+
+
+def test_a_thinned_collider_has_the_normals_of_the_whole_one(head, whole):
+    bones = transforms(head)
+    thin = Collider(head, np.arange(len(head.vertices)), spacing=0.03)
+    assert 100 < len(thin.kept) < 300  # 26 mm from side to side: every second
+    for all_of_it, some in zip(whole.pose(bones), thin.pose(bones), strict=True):
+        assert torch.equal(all_of_it[:, thin.kept], some)
 
 
 def test_a_collider_is_posed_by_its_weights(head, whole):

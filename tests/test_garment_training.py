@@ -17,10 +17,16 @@ from skinlib.garments.binding import signed_distance
 from skinlib.garments.collision import vertex_normals
 from skinlib.garments.energies import EnergyWeights, total_energy
 from skinlib.garments.garment import Garment
-from skinlib.garments.motion import Motion
+from skinlib.garments.motion import Motion, mirrored
 from skinlib.garments.outfit import Outfit, load_outfit
 from skinlib.garments.pbns import PBNSConfig
-from skinlib.garments.training import GarmentConfig, Trainer, layer_energy, train
+from skinlib.garments.training import (
+    GarmentConfig,
+    Trainer,
+    layer_energy,
+    train,
+    training_poses,
+)
 from skinlib.head import HeadError
 from skinlib.skinning import linear_blend_skinning
 
@@ -250,7 +256,10 @@ def test_random_poses_are_kept_and_used_again(outfit, tmp_path, monkeypatch, dra
     found = train(config, outfit, tmp_path / "run")
     assert drawn == [9]
     assert same(found, train(config, outfit, tmp_path / "whole"))
-    assert same(found, train(config, outfit, tmp_path / "given", bends(9)))
+    both = training_poses(outfit.body.head, 9, 0, 0.0)
+    assert len(both) == 18 and np.array_equal(both.rotations[:9], bends(9).rotations)
+    assert np.array_equal(both.translations[9:], mirrored(bends(9)).translations)
+    assert same(found, train(config, outfit, tmp_path / "given", both))
 
 
 def test_another_count_of_poses_is_another_run(outfit, tmp_path, drawn):

@@ -7,7 +7,14 @@ import pytest
 from test_body import NAMES, SIDES, bends, sleeve, small_body
 from test_outfit import band
 
-from skinlib.garments.measures import Measures, joined, measure, skinned
+from skinlib.garments.measures import (
+    Measures,
+    inside_out,
+    joined,
+    measure,
+    skinned,
+    turned_over,
+)
 from skinlib.garments.motion import Motion
 from skinlib.garments.outfit import Outfit
 from skinlib.skinning import linear_blend_skinning
@@ -93,13 +100,55 @@ def test_a_corner_of_the_hem_folded_down_turns_two_faces(radius, turned):
     found = measure(outfit, still(1), frames(folded))
     # 3 cm away from the skin, nobody says which side should look out.
     assert found.turned == pytest.approx(100 * turned / len(outfit.faces))
+    # The cloth itself does.
+    assert found.flipped == pytest.approx(100 * 2 / len(outfit.faces))
 
 
 def test_a_mirror_turns_all_faces_and_a_motion_none(outfit):
     mirrored = outfit.vertices * np.float32([-1, 1, 1])
-    assert measure(outfit, still(1), frames(mirrored)).turned == 100
+    found = measure(outfit, still(1), frames(mirrored))
+    assert (found.turned, found.flipped) == (100, 0)  # as a whole
     motion = bends(3, angle=0.2)
-    assert measure(outfit, motion, skinned(outfit, motion)).turned == 0
+    found = measure(outfit, motion, skinned(outfit, motion))
+    assert (found.turned, found.flipped) == (0, 0)
+
+
+def crease(gap: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two skins that face each other: floor of bone 0, ceiling of 1 `gap` above."""
+    square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    body = np.concatenate([square, square + np.array([0, 0, gap])])
+    return body, np.concatenate([faces, 4 + faces[:, ::-1]]), np.eye(2)[[0, 0, 1, 1]]
+
+
+@pytest.mark.parametrize("height", [0.003, 0.01, 0.017])
+@pytest.mark.parametrize("bone", [0, 1])
+def test_in_a_crease_cloth_is_judged_by_its_own_skin(height, bone):
+    """The other side of the crease may be nearer: it sees the outside, rightly."""
+    body, faces, moves = crease(0.02)
+    centres, right = np.array([[0.1, 0.2, height]]), np.array([[0, 0, 1.0 - 2 * bone]])
+    cloth = centres, right, body, faces, np.eye(2)[[bone]], moves
+    assert not inside_out(*cloth)[0]
+    assert inside_out(centres, -right, *cloth[2:])[0]
+    # It has to be near its own skin, too.
+    body, faces, moves = crease(0.05)
+    far = np.array(
+        [[0, 0, 0.025 + (0.5 - bone) * 0.03]]
+    )  # 40 mm off it, 10 off the other
+    assert not inside_out(far, -right, body, faces, np.eye(2)[[bone]], moves)[0]
+
+
+def test_a_triangle_that_looks_back_is_turned_over():
+    """A fan of four, of which one is folded under its neighbour; a pleat is none."""
+    rest = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0.0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]])
+    up = np.array([0, 0, 1.0])
+    assert not turned_over(np.array([[up] * 4]), rest, faces).any()
+    assert not turned_over(np.array([[-up] * 4]), rest, faces).any()  # all of it
+    under = turned_over(np.array([[up, up, -up, up], [up] * 4]), rest, faces)
+    assert under.tolist() == [[False, False, True, False], [False] * 4]
+    # Folded in the middle, it has no side that is the wrong one.
+    assert not turned_over(np.array([[up, -up, -up, up]]), rest, faces).any()
 
 
 def test_the_body_is_where_the_motion_puts_it(outfit):
@@ -155,14 +204,15 @@ def test_motions_are_joined_one_after_the_other():
 
 
 def test_all_numbers_are_in_the_line():
-    measures = Measures(1, 2, 3, 4, 5, 6, 7)
+    measures = Measures(1, 2, 3, 4, 5, 6, 7, 8)
     assert measures.line().split(", ") == [
         "elongation 1.000",
         "stretch 2.000",
         "bend 3.000",
         "turned 4.000",
-        "inside 5.000",
-        "deep 6.000",
-        "deepest 7.000",
+        "flipped 5.000",
+        "inside 6.000",
+        "deep 7.000",
+        "deepest 8.000",
         "through 0.000",
     ]

@@ -16,6 +16,7 @@ from skinlib.garments.motion import (
     bend,
     held_out_motions,
     joint_axes,
+    mirrored,
     random_poses,
     reach,
     read_motion,
@@ -124,6 +125,10 @@ def test_matrices_turn_as_the_rotation_vectors_say(skeleton):
         ({"rotations": np.zeros((0, 3, 3))}, "1 or more"),
         ({"rotations": np.full((2, 3, 3), "a")}, "rotations: <U1 values"),
         ({"rotations": np.full((2, 3, 3), 1e300)}, "NaN or infinity"),
+        (
+            {"rotations": np.full((2, 3, 3), 45.0)},
+            r"'a' turns by 77\.9 radians in frame 0\. Give rotation vectors in radians",
+        ),
         ({"translations": np.zeros((1, 3))}, r"translations.*shape \(2, 3\)"),
         ({"translations": np.array([[0, 0, 0], [0, np.inf, 0]])}, "is frame 1"),
         ({"fps": 0.0}, "fps: it is 0"),
@@ -534,3 +539,30 @@ def test_amounts_out_of_range_are_refused(skeleton):
 def test_both_ends_of_every_documented_range_work(skeleton, name, amounts):
     assert set(amounts) < set(inspect.signature(MOTIONS[name]).parameters)
     assert_within_limits(skeleton, MOTIONS[name](skeleton, **amounts))
+
+
+def test_a_mirrored_pose_puts_the_body_where_a_mirror_shows_it(skeleton):
+    motion = random_poses(skeleton, 5, seed=3)
+    motion = Motion.create(
+        motion.rotations, motion.bone_names, np.arange(15).reshape(5, 3)
+    )
+    other = mirrored(motion)
+    names = [name.replace(".L", ".?") for name in skeleton.names]
+    names = [name.replace(".R", ".L").replace(".?", ".R") for name in names]
+    swapped = [skeleton.names.index(name) for name in names]
+
+    def joints(motion):
+        homogeneous = np.append(skeleton.joints, np.ones((36, 1)), 1)[..., None]
+        return (motion.transforms(skeleton) @ homogeneous)[..., :3, 0]
+
+    # The shipped skeleton itself is even to 2 mm.
+    assert np.abs(joints(other) - joints(motion)[:, swapped] * [-1, 1, 1]).max() < 0.006
+    np.testing.assert_array_equal(mirrored(other).rotations, motion.rotations)
+    np.testing.assert_array_equal(mirrored(other).translations, motion.translations)
+
+
+def test_a_mirror_leaves_bones_without_a_partner_in_place():
+    names = ["spine", "spine01", "ax.L", ".R", "hand.R"]
+    turns = np.arange(15.0).reshape(1, 5, 3) / 10
+    found = mirrored(Motion.create(turns, names)).rotations[0]
+    np.testing.assert_allclose(found, turns[0] * [1, -1, -1], atol=1e-6)

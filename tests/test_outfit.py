@@ -13,6 +13,7 @@ from test_body import SIDES, bends, sleeve, small_body, tube
 from test_pbns import learnt
 
 from skinlib.garments.body import write_body
+from skinlib.garments.collision import NEAR, near
 from skinlib.garments.garment import Garment, write_garment
 from skinlib.garments.motion import Motion
 from skinlib.garments.outfit import INFLUENCES, Outfit, load_outfit, save_outfit
@@ -199,6 +200,16 @@ def test_a_network_for_one_body_has_no_shapes(outfit, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("ease", [0.11, -0.06, float("nan")])
+def test_an_ease_that_was_never_learnt_is_refused(outfit, network, tmp_path, ease):
+    still = Motion.create(np.zeros((1, 3, 3)), outfit.body.head.skeleton.names)
+    with pytest.raises(HeadError, match=r"ease: it is .*Give -0\.05 to 0\.1"):
+        outfit.pose(network, still, ease=ease)
+    with pytest.raises(HeadError, match="ease"):
+        outfit.export(tmp_path / "a.glb", network, still, ease=ease)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_motion_of_other_bones_is_refused(outfit, network, tmp_path):
     motion = Motion.create(np.zeros((1, 2, 3)), ("hips", "spine"))
     with pytest.raises(HeadError, match="a motion of 2 bones"):
@@ -207,6 +218,42 @@ def test_a_motion_of_other_bones_is_refused(outfit, network, tmp_path):
         outfit.export(tmp_path / "a.glb", network, motion)
     with pytest.raises(HeadError, match="no shape 'thin'"):
         outfit.pose(network, bends(), {"thin": 1})
+
+
+# --- what it can touch ----------------------------------------------------------------
+
+
+def waving() -> Outfit:
+    """A ring low on a post of which the upper half folds down, beside the ring."""
+    body = small_body()
+    height = body.head.vertices[:, 2]
+    head = body.head.replace(weights=np.eye(3)[np.where(height > 0.52, 1, 0)])
+    vertices, faces = tube(0.115, 0.1, 0.2, 3)
+    ring = Garment.create(vertices, faces, name="ring")
+    return Outfit(replace(body, head=head), (ring,))
+
+
+def test_what_comes_near_in_a_pose_is_an_obstacle():
+    """As a hand is to a shirt, when somebody reaches across the chest."""
+    worn = waving()
+    height = worn.body.head.vertices[:, 2]
+    folded = np.zeros((2, 3, 3))
+    folded[1, 1, 0] = np.pi  # bone 1 begins at 0.35: what was at 0.6 comes to 0.1
+    motion = Motion.create(folded, worn.body.head.skeleton.names)
+    at_rest = worn.collider.vertices
+    assert height[at_rest].max() < 0.46
+    close = near(worn.body.head, worn.vertices, NEAR)
+    assert worn.collider_in(motion, 0, 0.0) is worn.collider
+    assert worn.network(SMALL, 0, False, 0).bones.tolist() == []
+    collider = worn.collider_in(motion, smoothing=0, touch=0.03)
+    assert np.isin(close, collider.vertices).all()
+    others = height[np.setdiff1d(collider.vertices, close)]
+    # The ring is at 0.1 to 0.2, and 3 cm are a touch: between 0.47 and 0.63 at rest.
+    assert 0.52 < others.min() and others.max() < 0.64 and len(others) >= 2 * SIDES
+    network = worn.network(SMALL, 0, False, 0, collider)
+    assert network.bones.tolist() == [1]
+    still = Motion.create(folded[:1], motion.bone_names)
+    assert np.array_equal(worn.collider_in(still, 0, 0.03).vertices, close)
 
 
 # --- folders --------------------------------------------------------------------------
@@ -229,6 +276,20 @@ def test_a_folder_holds_all_of_it(outfit, tmp_path, shapes):
     save_outfit(tmp_path / "again", found, same, {})
     last = load_outfit(tmp_path / "again")
     assert np.array_equal(last[0].pose(last[1], bends(), shape), poses[0])
+
+
+def test_a_network_of_an_older_version_has_the_units_of_then(outfit, tmp_path):
+    plain = replace(SMALL, slope=0.0, rounding=0.0)
+    network = learnt(outfit.network(plain, 2, False, 0)).eval()
+    save_outfit(tmp_path / "run", outfit, network, {})
+    weights = tmp_path / "run" / "model.safetensors"
+    tensors, metadata = read_tensors(weights)
+    config = json.loads(metadata["config"])
+    del config["network"]["slope"], config["network"]["rounding"]
+    write_tensors(weights, tensors, {"config": json.dumps(config)})
+    found, same = load_outfit(tmp_path / "run")
+    assert (same.config.slope, same.config.rounding) == (0, 0)
+    assert np.array_equal(found.pose(same, bends()), outfit.pose(network, bends()))
 
 
 def spoil(folder, kind: str) -> None:

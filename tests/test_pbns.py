@@ -76,6 +76,37 @@ def test_the_same_seed_is_the_same_network(outfit, network):
     assert not torch.equal(other[weight], same[weight])
 
 
+@pytest.mark.parametrize("source", [False, True])
+def test_every_column_can_learn_unlike_those_of_the_source(outfit, source):
+    """A ReLU that is off in all poses passes no gradient to its column, nor itself."""
+    config = PBNSConfig(slope=0.0, rounding=0.0) if source else PBNSConfig()
+    network, motion = outfit.network(config, 2, False, 0), bends(200)
+    amounts = network.embed(network.inputs(motion.rotations))
+    assert amounts.min() >= 0
+    asleep = (amounts == 0).all(0)
+    posed, _ = network(network.inputs(motion.rotations), transforms(outfit, motion))
+    posed[..., 2].square().sum().backward()
+    moved = network.columns.grad.any(dim=1)
+    assert torch.equal(moved, ~asleep)
+    assert asleep.any() == source
+
+
+def test_the_last_unit_is_a_relu_with_a_round_corner():
+    unit = outfit_units(PBNSConfig())[-1]
+    far = torch.tensor([-2.0, 0, 2])
+    # 0.05 ln 2 in the corner.
+    assert unit(far).tolist() == pytest.approx([0, 0.03466, 2], abs=1e-4)
+    assert unit(far).min() >= 0
+    assert outfit_units(PBNSConfig())[1](far).tolist() == pytest.approx([-0.2, 0, 2])
+    source = PBNSConfig(slope=0.0, rounding=0.0)
+    assert {type(unit) for unit in outfit_units(source)[1::2]} == {torch.nn.ReLU}
+
+
+def outfit_units(config: PBNSConfig) -> torch.nn.Sequential:
+    none, one = np.zeros((0, 1, 3), np.float32), np.ones((1, 1), np.float32)
+    return PBNS(np.zeros((1, 3), np.float32), one, np.array([0]), none, config).embed
+
+
 # --- blend weights --------------------------------------------------------------------
 
 

@@ -11,10 +11,11 @@ from scipy.sparse import coo_matrix
 from trimesh.triangles import points_to_barycentric
 
 from skinlib.garments.garment import Garment
-from skinlib.geometry import mesh_edges
+from skinlib.geometry import face_normals, mesh_edges
 from skinlib.head import Head, HeadError
 
 FAR = 0.3  # metres: no garment hangs further from the skin, in the median
+SMALLEST = 0.02  # of the body's longest side: nothing that is worn is smaller
 MOST_INSIDE = 0.2  # share of a garment's vertices that may begin inside the body
 MOST_THROUGH = 0.01  # and of an outer layer's that may begin inside the inner one
 
@@ -90,9 +91,12 @@ def check_fit(garment: Garment, head: Head) -> np.ndarray:
     """(V,) float64 metres from the skin to each vertex, negative inside the body.
 
     Raises:
-        HeadError: the garment is far from the body, as one in other units, axes or at
-            another place is; or more than a fifth of it is inside the body.
+        HeadError: the garment is far from the body or tiny, as one in other units, axes
+            or at another place is; more than a fifth of it is inside the body; or it
+            shows the body its outside.
     """
+    import igl  # here, since it takes long to load
+
     body = head.vertices
     distance = signed_distance(garment.vertices, body, head.faces)
     median = float(np.median(np.abs(distance)))
@@ -106,6 +110,12 @@ def check_fit(garment: Garment, head: Head) -> np.ndarray:
             f"the body {_size(body)} round {_middle(body)}",
             "check scale, axes and position: metres, Z up, on the body at rest",
         )
+    if np.ptp(garment.vertices, axis=0).max() < SMALLEST * np.ptp(body, axis=0).max():
+        raise HeadError(
+            "vertices",
+            f"the garment measures {_size(garment.vertices)}, the body {_size(body)}",
+            "check its scale: metres, on the body at rest",
+        )
     inside = float((distance < 0).mean())
     if inside > MOST_INSIDE:
         raise HeadError(
@@ -113,6 +123,21 @@ def check_fit(garment: Garment, head: Head) -> np.ndarray:
             f"{inside:.0%} of the garment's vertices lie inside the body, the deepest "
             f"{-distance.min() * 1000:.0f} mm",
             "put it on in the body's rest pose, or push it out along the normals",
+        )
+    normals = face_normals(garment.vertices, garment.faces)  # twice the area long
+    middles = garment.vertices[garment.faces].mean(axis=1).astype(np.float64)
+    _, skin, _ = igl.point_mesh_squared_distance(
+        middles, body.astype(np.float64), head.faces
+    )
+    away = (normals * face_normals(body, head.faces)[skin]).sum(axis=1) < 0
+    areas = np.linalg.norm(normals, axis=1)
+    share = float(areas[away].sum() / areas.sum())
+    if share > 0.5:
+        name = garment.name or "the garment"
+        raise HeadError(
+            "faces",
+            f"{share:.0%} of {name} shows its outside to the skin",
+            "turn its faces round (flip the normals)",
         )
     return distance
 

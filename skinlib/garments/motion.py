@@ -25,6 +25,9 @@ from skinlib.head import Head, HeadError, Skeleton
 from skinlib.io import atomic
 from skinlib.skinning import descendants, forward_kinematics, linear_blend_skinning
 
+MOST_TURNED = 4 * np.pi
+"""Radians: a longer rotation vector is most likely one in degrees."""
+
 FORWARD, UP = np.array([0.0, -1, 0]), np.array([0.0, 0, 1])
 
 
@@ -62,7 +65,8 @@ class Motion:
         """Check everything and make a `Motion`; the root stays when not translated.
 
         Raises:
-            HeadError: a wrong shape, NaN, no frame, or a frame rate not above 0.
+            HeadError: a wrong shape, NaN, no frame, a frame rate not above 0, or
+                rotations of several turns, as those in degrees are.
 
         >>> Motion.create(np.zeros((2, 1, 3)), ["head"]).matrices()[0, 0].tolist()
         [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -73,6 +77,15 @@ class Motion:
             translations = np.zeros((len(rotations), 3))
         shape = (len(rotations), 3)
         translations = _numbers(translations, "translations", shape, file)
+        angle = np.linalg.norm(rotations.astype(np.float64), axis=-1)
+        if angle.max() > MOST_TURNED:
+            frame, bone = np.unravel_index(angle.argmax(), angle.shape)
+            raise HeadError(
+                "rotations",
+                f"{names[bone]!r} turns by {angle.max():.3g} radians in frame {frame}",
+                "give rotation vectors in radians: a whole turn is 6.28 long",
+                file,
+            )
         if not (np.isfinite(fps) and fps > 0):
             raise HeadError("fps", f"it is {fps:g}", "give frames per second", file)
         return cls(rotations, translations, names, float(fps), str(name))
@@ -542,6 +555,30 @@ def _drawn(skeleton: Skeleton, seed: int, pose: int, attempt: int) -> np.ndarray
         low, high = np.transpose(joint[:3])
         angles[name] = size * rng.uniform(low, high)
     return bend(skeleton, angles)
+
+
+SIDES = {".L": ".R", ".R": ".L"}
+
+
+def mirrored(motion: Motion) -> Motion:
+    """The same poses with left and right exchanged, as a mirror at x = 0 shows them.
+
+    Bones are exchanged by the ends of their names, .L and .R; others stay.
+
+    >>> lift = Motion.create([[[1, 2, 3], [0, 0, 0]]], ["hand.L", "hand.R"])
+    >>> mirrored(lift).rotations[0].tolist()
+    [[0.0, -0.0, -0.0], [1.0, -2.0, -3.0]]
+    """
+    names = motion.bone_names
+    place = {name: bone for bone, name in enumerate(names)}
+    other = [
+        place.get(name[:-2] + SIDES.get(name[-2:], name[-2:]), bone)
+        for bone, name in enumerate(names)
+    ]
+    # A rotation is no arrow: the mirror turns its axis round, but for what is along x.
+    rotations = motion.rotations[:, other] * np.float32([1, -1, -1])
+    translations = motion.translations * np.float32([-1, 1, 1])
+    return Motion.create(rotations, names, translations, motion.fps, motion.name)
 
 
 # --- procedural motions -------------------------------------------------------------

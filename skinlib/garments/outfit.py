@@ -20,7 +20,7 @@ from skinlib.garments.binding import (
     smooth,
 )
 from skinlib.garments.body import Body, read_body, write_body
-from skinlib.garments.collision import Collider, near
+from skinlib.garments.collision import NEAR, Collider, near, reached
 from skinlib.garments.energies import Cloth
 from skinlib.garments.garment import Garment, read_garment, write_garment
 from skinlib.garments.motion import Motion
@@ -40,6 +40,16 @@ INFLUENCES = 8  # bones a vertex: two sets in glTF
 CARRIED = 20  # rounds of smoothing of what the body's shapes do to the cloth
 MOVES = 0.5
 """A bone counts when the weights it has add up to more than half a vertex."""
+
+LOOKED_AT, SPACING = 2000, 0.008
+"""Poses in which we look what a garment touches: a few seconds; and metres between the
+points of that: fingers are modelled finer than cloth can feel."""
+
+EASE_RANGE = (-0.05, 0.1)
+"""By how much cloth is cut wider in training with shapes."""
+
+BEFORE = {"slope": 0.0, "rounding": 0.0}
+"""What networks had that were written before these settings."""
 
 BODY = "body.npz"
 FRAMES = 64  # posed at once
@@ -109,16 +119,22 @@ class Outfit:
         return limit_influences(weights, INFLUENCES).astype(np.float32)
 
     def network(
-        self, config: PBNSConfig, smoothing: int, shapes: bool, seed: int
+        self,
+        config: PBNSConfig,
+        smoothing: int,
+        shapes: bool,
+        seed: int,
+        collider: Collider | None = None,
     ) -> PBNS:
         """An untrained network: linear blend skinning.
 
         Args:
             shapes: let it learn the shapes of the body, too.
+            collider: what the garments can touch; it reads the bones that move it.
         """
-        weights = self.blend_weights(smoothing)
+        weights, obstacle = self.blend_weights(smoothing), collider or self.collider
         # The bones that move the cloth or what it lies on; not the root, see `inputs`.
-        moved = self.collider.weights.numpy().sum(0) + weights.sum(0) > MOVES
+        moved = obstacle.weights.numpy().sum(0) + weights.sum(0) > MOVES
         moved &= self.body.head.skeleton.parents >= 0
         carried = np.zeros((0, len(weights), 3), np.float32)
         if shapes:
@@ -144,8 +160,24 @@ class Outfit:
 
     @cached_property
     def collider(self) -> Collider:
-        """The part of the body that the garments can touch."""
+        """The part of the body that the garments can touch at rest."""
         return Collider(self.body.head, near(self.body.head, self.vertices))
+
+    def collider_in(self, motion: Motion, smoothing: int, touch: float) -> Collider:
+        """The part that they can touch at rest or in one of the poses.
+
+        Args:
+            smoothing: of the blend weights that move them meanwhile.
+            touch: metres within which what is skinned so is touched; 0 for `collider`.
+        """
+        if not touch:
+            return self.collider
+        head, step = self.body.head, -(-len(motion) // LOOKED_AT)
+        transforms = motion.transforms(head.skeleton)[::step]
+        weights = self.blend_weights(smoothing)
+        touched = reached(head, self.vertices, weights, transforms, touch)
+        everything = np.union1d(touched, near(head, self.vertices, NEAR))
+        return Collider(head, everything, SPACING)
 
     @cached_property
     def overlaps(self) -> list[tuple[slice, slice, np.ndarray]]:
@@ -167,11 +199,11 @@ class Outfit:
 
         Args:
             shape: amounts of the body's shapes, such as `{"weight": 0.5}`.
-            ease: by how much the cloth is cut wider, 0.1 for 10 %.
+            ease: by how much the cloth is cut wider, -0.05 to 0.1, which is 10 %.
 
         Raises:
-            HeadError: the bones of the motion are not those of the body, or a shape
-                for a network that has not learnt any.
+            HeadError: the bones of the motion are not those of the body, a shape for a
+                network that has not learnt any, or an ease that it has not learnt.
         """
         inputs, transforms, amounts = self._read(network, motion, shape, ease)
         with torch.inference_mode():
@@ -185,6 +217,9 @@ class Outfit:
             raise HeadError(
                 "shape", "this garment was made for one body", "train it with --shapes"
             )
+        low, high = EASE_RANGE
+        if not low <= ease <= high:
+            raise HeadError("ease", f"it is {ease:g}", f"give {low:g} to {high:g}")
         amounts = np.tile(self.body.coefficients(shape or {}), (frames, 1))
         transforms = torch.from_numpy(self.body.transforms(motion, amounts))
         inputs = network.inputs(motion.rotations, amounts, np.full(frames, ease))
@@ -275,7 +310,7 @@ def load_outfit(folder: str | Path) -> tuple[Outfit, PBNS]:
     tensors, metadata = read_tensors(folder / WEIGHTS)
     try:
         stored = json.loads(metadata["config"])
-        config = PBNSConfig(**stored["network"])
+        config = PBNSConfig(**BEFORE | stored["network"])
         names = list(zip(stored["garments"], stored["names"], strict=True))
         buffers = [tensors[key].numpy() for key in PBNS.BUFFERS]
         network = PBNS(*buffers, config)

@@ -22,7 +22,13 @@ class PBNSConfig:
     hidden: int = 64  # width of the layers; the source: 32
     embedding: int = 64  # |X|, the number of columns of D: blend shapes; the source: 32
     layers: int = 4
+    slope: float = 0.1  # of hidden units that are off; the source: 0, a ReLU
+    rounding: float = 0.05  # of the corner of the last ReLU; the source: 0
     learn_weights: bool = True  # blend weights, too; the source: for loose garments
+
+
+def _unit(slope: float) -> nn.Module:
+    return nn.LeakyReLU(slope) if slope else nn.ReLU()
 
 
 class PBNS(nn.Module):
@@ -30,7 +36,9 @@ class PBNS(nn.Module):
 
     A pose becomes an embedding X by a perceptron, X mixes the columns of D into offsets
     of the rest positions, and the bones move what results. D starts at 0: the untrained
-    network is linear blend skinning.
+    network is linear blend skinning. With the source's units most columns never learn:
+    a ReLU that is off in every pose passes nothing on. So hidden units leak, and the
+    last ones are softplus: a ReLU with a round corner, more than 0 in every pose.
 
     Attributes:
         template: (V, 3) garment at rest.
@@ -62,7 +70,9 @@ class PBNS(nn.Module):
         widths.append(self.config.embedding)
         self.embed = nn.Sequential()
         for a, b in pairwise(widths):
-            self.embed.append(nn.Linear(a, b)).append(nn.ReLU())
+            self.embed.append(nn.Linear(a, b)).append(_unit(self.config.slope))
+        if self.config.rounding:
+            self.embed[-1] = nn.Softplus(beta=1 / self.config.rounding)
         self.columns = nn.Parameter(
             torch.zeros(self.config.embedding, 3 * len(template))
         )

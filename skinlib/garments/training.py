@@ -26,16 +26,22 @@ from skinlib.garments.energies import (
     pin_energy,
     total_energy,
 )
-from skinlib.garments.motion import Motion, random_poses, read_motion, write_motion
-from skinlib.garments.outfit import Outfit, save_outfit
+from skinlib.garments.motion import (
+    Motion,
+    mirrored,
+    random_poses,
+    read_motion,
+    write_motion,
+)
+from skinlib.garments.outfit import EASE_RANGE, Outfit, save_outfit
 from skinlib.garments.pbns import PBNS, PBNSConfig
-from skinlib.head import HeadError
+from skinlib.head import Head, HeadError
 from skinlib.training.checkpoint import STATE
 from skinlib.training.run import Run
 
 POSES = "poses.npz"
 SLID = 0.15  # metres that a garment may hang lower than it was drafted
-SHAPE_RANGE, EASE_RANGE = 0.6, (-0.05, 0.1)
+SHAPE_RANGE = 0.6
 
 
 @dataclass(frozen=True)
@@ -43,13 +49,16 @@ class GarmentConfig:
     """What a training run is; with the same outfit it gives the same network."""
 
     steps: int = 10_000
-    poses: int = 4_000  # drawn once, within joint limits, see `random_poses`
+    poses: int = 8_000  # drawn once, see `random_poses`; their mirror images are added
     gap: float = 0.015  # metres between the limbs in them: room for the cloth
     batch: int = 16  # poses a step
     learning_rate: float = 2e-3  # falls to 1 % along a cosine
     weights_rate: float = 10.0  # times that for learnt blend weights
     smoothing: int = 10  # of the blend weights; 50 for a skirt
     epsilon: float = 0.004  # metres that the cloth keeps from the body, and layers
+    # Metres: what comes so near in a pose is an obstacle, such as a hand. 0: what is
+    # near at rest; hands go into a skirt in many poses, and it cannot evade them all.
+    touch: float = 0.06
     shapes: bool = False  # learn the shapes of the body and looser cuts, too
     seed: int = 0  # of parameters, poses and their order
     threads: int = 2  # another number, other last bits
@@ -79,6 +88,22 @@ def train(
     return trainer.run()
 
 
+def training_poses(body: Head, count: int, seed: int, gap: float) -> Motion:
+    """`count` random poses of a body, and their mirror images: twice as many.
+
+    Args:
+        gap: metres between the limbs, see `random_poses`.
+    """
+    drawn = random_poses(body.skeleton, count, seed, body, gap)
+    other = mirrored(drawn)
+    return Motion.create(
+        np.concatenate([drawn.rotations, other.rotations]),
+        drawn.bone_names,
+        np.concatenate([drawn.translations, other.translations]),
+        name=drawn.name,
+    )
+
+
 class Trainer(Run):
     """One training run; see `train`. `step()` is one step, for a look inside."""
 
@@ -97,11 +122,12 @@ class Trainer(Run):
         if poses is None:
             poses = self._random_poses()
         device = config.device
+        collider = outfit.collider_in(poses, config.smoothing, config.touch)
         self.network = outfit.network(
-            config.network, config.smoothing, config.shapes, config.seed
+            config.network, config.smoothing, config.shapes, config.seed, collider
         ).to(device)
         self.cloth = copy.deepcopy(outfit.cloth).to(device)
-        self.collider = copy.deepcopy(outfit.collider).to(device)
+        self.collider = copy.deepcopy(collider).to(device)
         self.pinned = torch.from_numpy(outfit.pinned).to(device)
         self._draw(poses)
         parameters, change = self.network.parameters(), self.network.weight_change
@@ -112,11 +138,11 @@ class Trainer(Run):
 
     def _random_poses(self) -> Motion:
         """Those of the configuration; kept in `out`, as drawing them takes minutes."""
-        path, skeleton = self.out / POSES, self.body.skeleton
+        path = self.out / POSES
         if path.exists() and (self.out / STATE).exists():
             return read_motion(path)
         config = self.config
-        poses = random_poses(skeleton, config.poses, config.seed, self.body, config.gap)
+        poses = training_poses(self.body, config.poses, config.seed, config.gap)
         self.out.mkdir(parents=True, exist_ok=True)
         write_motion(path, poses)
         return poses

@@ -26,6 +26,7 @@ from skinlib.garments.measures import skinned
 from skinlib.garments.motion import JOINTS, Motion, bend
 from skinlib.garments.outfit import Outfit
 from skinlib.garments.pbns import PBNS
+from skinlib.garments.training import GarmentConfig
 from skinlib.head import Head
 from skinlib.skinning import linear_blend_skinning
 from skinlib.views import scenes
@@ -317,8 +318,11 @@ def drape(
         (1, V, 3) posed vertices, and each energy in joules, weighted, before each step.
     """
     transforms = torch.from_numpy(motion.transforms(outfit.body.head.skeleton)[:1])
-    body, normals = outfit.collider.pose(transforms)
-    skin = torch.from_numpy(outfit.blend_weights(50 if outfit.pinned.any() else 10))
+    smoothing = 50 if outfit.pinned.any() else 10
+    touch = 0.0 if outfit.pinned.any() else GarmentConfig.touch
+    obstacle = outfit.collider_in(motion, smoothing, touch)
+    body, normals = obstacle.pose(transforms)
+    skin = torch.from_numpy(outfit.blend_weights(smoothing))
     rest, pinned = torch.from_numpy(outfit.vertices), torch.from_numpy(outfit.pinned)
     offsets = torch.zeros(1, *rest.shape, requires_grad=True)
     optimizer = torch.optim.Adam([offsets], lr=rate)
