@@ -144,6 +144,10 @@ def quick(bench: Bench) -> dict:
             network = bench.trained(run, QUICK, **narrow(name, best, seed))
             found[f"{name} {best:g} {seed}"] = bench.judged(network, tests)
         found[f"{name} best rate"] = best
+    for seed in SEEDS:
+        settings = narrow("dsffnet", found["dsffnet best rate"], seed, mirrored=True)
+        network = bench.trained(f"quick/mirrored_{seed}", QUICK, **settings)
+        found[f"dsffnet, mirrored, {seed}"] = bench.judged(network, tests)
     return found
 
 

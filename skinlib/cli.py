@@ -676,6 +676,7 @@ def pose_train(
     steps: Annotated[int, arg(metavar="N")] = 51_200,
     rate: Annotated[float, arg(metavar="R")] = 2e-3,
     noise: Annotated[float, arg(metavar="A")] = 0.0,
+    mirrored: bool = False,
     seed: Annotated[int, arg(metavar="S")] = 0,
     device: Annotated[str, arg(metavar="D")] = "cpu",
     threads: Annotated[int, arg(metavar="T")] = min(2, os.cpu_count() or 1),
@@ -704,6 +705,7 @@ def pose_train(
         steps: How long to train, 8 pairs a step.
         rate: The highest learning rate.
         noise: On the sources, as a share of their size, such as 0.01.
+        mirrored: Learn all of them in a mirror, too.
         seed: Same seed, same network.
         device: Where to compute, such as cpu or cuda.
         threads: CPU cores to use.
@@ -728,6 +730,7 @@ def pose_train(
         steps=steps,
         learning_rate=rate,
         noise=noise,
+        mirrored=mirrored,
         seed=seed,
         device=_device(device),
         threads=threads,

@@ -96,7 +96,7 @@ def skin(run, *args) -> np.ndarray:
         ("pose train", "--out --people --vertices --identities --poses --network"),
         (
             "pose train",
-            "--wide --width --steps --rate --noise --seed --device --threads",
+            "--wide --mirrored --width --steps --rate --noise --seed --device --threads",
         ),
         ("pose transfer", "SOURCE TARGET OUT --model --reach .glb .obj"),
         ("pose evaluate", "DIR --pairs --json"),
@@ -368,7 +368,7 @@ def test_train_a_pose_transfer_judge_it_and_use_it(run, posts, capsys):
 
 
 def test_options_of_pose_train_reach_the_training(run, posts):
-    options = "--network npt --rate 0.01 --noise 0.02 --seed 3 --identities 2 --wide"
+    options = "--network npt --rate 0.01 --noise 0.02 --seed 3 --identities 2 --wide --mirrored"
     assert run(*POSE.split(), *options.split(), "--steps", "1", "--out", "npt") == 0
     config = json.loads((posts / "npt" / "config.json").read_text())
     training, population = config["training"], config["population"]
@@ -376,7 +376,7 @@ def test_options_of_pose_train_reach_the_training(run, posts):
     assert training["learning_rate"] == 0.01 and training["noise"] == 0.02
     assert training["seed"] == population["seed"] == 3
     assert population["identities"] == 2 and population["vertices"] == []
-    assert population["limits"] == "wide"
+    assert population["limits"] == "wide" and training["mirrored"]
 
 
 @pytest.mark.parametrize(

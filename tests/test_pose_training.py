@@ -212,7 +212,14 @@ def test_a_run_ends_in_the_same_bits_after_an_interrupt(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "change", [{"learning_rate": 1e-4}, {"seed": 1}, {"network": "npt"}, {"noise": 0.1}]
+    "change",
+    [
+        {"learning_rate": 1e-4},
+        {"seed": 1},
+        {"network": "npt"},
+        {"noise": 0.1},
+        {"mirrored": True},
+    ],
 )
 def test_another_run_in_the_same_folder(tmp_path, change):
     train(TEN, [POSTS], tmp_path)
@@ -264,6 +271,33 @@ def test_all_meshes_take_part(tmp_path, few):
     for _ in range(20):
         trainer.step()
     assert len(seen) == 4
+
+
+def test_every_second_step_is_in_a_mirror(tmp_path):
+    config = TransferConfig(settings=SMALL, steps=4, threads=1, mirrored=True)
+    trainer = TransferTrainer(config, [POSTS], tmp_path)
+    network, given = trainer.network, []
+
+    class Noted(torch.nn.Module):
+        def forward(self, source, identity):
+            given.append((source, identity))
+            return network(source, identity)
+
+    trainer.network = Noted()
+    told = [trainer.step() for _ in range(2)]
+    for step, sign in ((0, 1), (1, -1)):
+        pairs = trainer.pairs[0].batch(range(8 * step, 8 * step + 8))
+        mirror = torch.tensor([sign, 1, 1])
+        assert torch.equal(given[step][0], pairs.source * mirror)
+        assert torch.equal(given[step][1], pairs.identity * mirror)
+    with torch.no_grad():
+        pairs = PosePairs(POSTS, POSTS, 8)
+        first = make_network("dsffnet", SMALL, 0)
+        items = pairs.batch(range(8))
+        off = first(items.source, items.identity) - items.truth
+    assert told[0]["PMD e-4"] == pytest.approx(
+        1e4 * off.square().mean().item(), rel=1e-4
+    )
 
 
 def test_a_loss_that_is_no_number_stops_the_run(tmp_path):

@@ -49,6 +49,7 @@ class TransferConfig:
     falls: int = 0  # or it falls so often, to 0.8; the source: 25, every 8 epochs
     edge_weight: float = EDGE_WEIGHT  # lambda
     noise: float = 0.0  # on the sources, as a share of their size
+    mirrored: bool = False  # every second step sees people and poses in a mirror
     seed: int = 0  # of parameters and pairs
     threads: int = 2  # another number, other last bits
     device: str = "cpu"
@@ -136,8 +137,12 @@ class TransferTrainer(Run):
         first = self.steps_done * config.batch
         items = range(first, first + config.batch)
         pairs = self.pairs[rng.integers(len(self.pairs))].batch(items)
-        predicted = self.network(pairs.source, pairs.identity)
-        loss = pose_loss(predicted, pairs.truth, pairs.edges, config.edge_weight)
+        source, identity, truth = pairs[:3]
+        if config.mirrored and self.steps_done % 2:
+            mirror = source.new_tensor([-1, 1, 1])
+            source, identity, truth = source * mirror, identity * mirror, truth * mirror
+        predicted = self.network(source, identity)
+        loss = pose_loss(predicted, truth, pairs.edges, config.edge_weight)
         self.optimizer.zero_grad()
         loss.backward()
         if not torch.isfinite(loss):
@@ -146,7 +151,7 @@ class TransferTrainer(Run):
                 f"learning_rate ({config.learning_rate})"
             )
         with torch.no_grad():
-            off = (predicted - pairs.truth).square().mean()
+            off = (predicted - truth).square().mean()
         told = {"loss": loss.item(), "PMD e-4": 1e4 * off.item()}
         self._update(told)
         return told
