@@ -94,10 +94,8 @@ def skin(run, *args) -> np.ndarray:
         ("garment play", "DIR --poses FILE|NAME --out --shape --ease .glb .npz"),
         ("garment evaluate", "DIR --poses --simulated --json"),
         ("pose train", "--out --people --vertices --identities --poses --network"),
-        (
-            "pose train",
-            "--wide --mirrored --width --steps --rate --noise --seed --device --threads",
-        ),
+        ("pose train", "--wide --mirrored --width --steps --rate --noise --seed"),
+        ("pose train", "--device --threads Ctrl-C"),
         ("pose transfer", "SOURCE TARGET OUT --model --reach .glb .obj"),
         ("pose evaluate", "DIR --pairs --json"),
         ("lab", "--port --no-browser Ctrl-C"),
@@ -368,8 +366,9 @@ def test_train_a_pose_transfer_judge_it_and_use_it(run, posts, capsys):
 
 
 def test_options_of_pose_train_reach_the_training(run, posts):
-    options = "--network npt --rate 0.01 --noise 0.02 --seed 3 --identities 2 --wide --mirrored"
-    assert run(*POSE.split(), *options.split(), "--steps", "1", "--out", "npt") == 0
+    options = "--network npt --rate 0.01 --noise 0.02 --seed 3 --identities 2 --wide"
+    options = [*options.split(), "--mirrored", "--steps", "1", "--out", "npt"]
+    assert run(*POSE.split(), *options) == 0
     config = json.loads((posts / "npt" / "config.json").read_text())
     training, population = config["training"], config["population"]
     assert config["pose transfer"] == "npt" and config["settings"]["width"] == 32
