@@ -301,23 +301,34 @@ def skeleton(bench: Bench) -> dict:
     """The same task through bones: what is known decides."""
     judges, first = QUICK.heads("judge"), QUICK.heads("train")[0]
     heads = on_mesh(judges, first, quick_mesh())
-    pairs = bench.tests(QUICK)["unseen"][0].batch(range(60))
-    found: dict[str, list[Scores]] = {"rest pose known": [], "a cloud of points": []}
-    for i in tqdm(range(len(pairs.who)), "through bones", unit="pair"):
+    known = npt_poses(first.skeleton, 400, 0)
+    network, _ = load_network(bench.out / "long" / "dsffnet")
+    pairs = bench.tests(QUICK)["unseen"][0].batch(range(40))
+    with torch.inference_mode():
+        posed = network(pairs.source, pairs.identity).numpy()
+    found: dict[str, list[Scores]] = {}
+    for i in tqdm(range(len(posed)), "through bones", unit="pair"):
         source, _, target, _ = pairs.who[i].tolist()
-        cloud = pairs.source[i].numpy()
+        cloud, order = pairs.source[i].numpy(), pairs.order[i].numpy()
         ordered = cloud[pairs.source_order[i].argsort().numpy()]
-        order = pairs.order[i].numpy()
-        edges, height = pairs.edges[i].numpy(), pairs.height[i].item()
         fits = {
             "rest pose known": fit_pose(heads[source], ordered, scaled=True),
-            "a cloud of points": fit_cloud(heads[target], cloud, scaled=True),
+            "cloud, from rest": fit_cloud(heads[target], cloud, True, starts=1),
+            "cloud, from known poses": fit_cloud(
+                heads[target], cloud, True, poses=known
+            ),
         }
+        results = {"dsffnet": posed[i], "copy": pairs.identity[i].numpy()}
         for label, fit in fits.items():
-            posed = normalised(apply_pose(fit, heads[target])[order])[0]
-            truth = pairs.truth[i].numpy()
-            found[label].append(score(posed, truth, edges, height))
-    return {label: asdict(mean_scores(scores)) for label, scores in found.items()}
+            results[label] = normalised(apply_pose(fit, heads[target])[order])[0]
+        rest = pairs.truth[i].numpy(), pairs.edges[i].numpy(), pairs.height[i].item()
+        for label, points in results.items():
+            found.setdefault(label, []).append(score(points, *rest))
+    return {
+        label: asdict(mean_scores(scores))
+        | {"median pmd": statistics.median(one.pmd for one in scores)}
+        for label, scores in found.items()
+    }
 
 
 def contact(bench: Bench) -> dict:
@@ -493,7 +504,9 @@ def _told(values) -> str:
         pmd = [1e4 * values[kind]["pmd"] for kind in ("seen", "unseen")]
         return "PMD e-4, seen and unseen: {:.1f} {:.1f}".format(*pmd)
     if isinstance(values, dict) and "pmd" in values:
-        return Scores(**values).line()
+        middle = values.pop("median pmd", None)
+        line = Scores(**values).line()
+        return line if middle is None else f"{line}, median PMD {1e4 * middle:.3g} e-4"
     return str(values)
 
 
