@@ -56,7 +56,7 @@ FULL = Population("anny", (1229,))
 RATES = {
     "dsffnet": (5e-4, 1e-3, 2e-3, 4e-3, 8e-3),
     "npt": (2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3),
-    "corenet": (5e-4, 1e-3, 2e-3, 4e-3),
+    "corenet": (5e-4, 1e-3, 2e-3, 4e-3, 8e-3),
 }
 SEEDS = (0, 1, 2)
 NARROW = {
