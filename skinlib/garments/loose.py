@@ -59,9 +59,8 @@ from skinlib.head import HeadError, Skeleton
 from skinlib.skinning import linear_blend_skinning
 from skinlib.training.checkpoint import (
     CONFIG,
-    STATE,
     WEIGHTS,
-    read_tensors,
+    reading_finished,
     replace_file,
     write_tensors,
 )
@@ -669,19 +668,8 @@ def load_loose(folder: str | Path) -> LooseGarment:
         HeadError: there is none, it is not finished, or a file is damaged.
     """
     folder = Path(folder)
-    path = folder / WEIGHTS
-    if not path.is_file():
-        unfinished = (folder / STATE).is_file()
-        raise HeadError(
-            "garment",
-            "its training has not ended" if unfinished else "there is no such file",
-            "run the same `skinlib garment train` again"
-            if unfinished
-            else "give a folder that `skinlib garment train --out` wrote",
-            path,
-        )
-    tensors, metadata = read_tensors(path)
-    try:
+    kind, command = "garment on virtual bones", "skinlib garment train"
+    with reading_finished(folder, "garment", kind, command) as (tensors, metadata):
         stored = json.loads(metadata["config"])
         arrays = {name: tensors.pop(name).numpy() for name in LooseGarment.ARRAYS}
         state = {key.removeprefix("network."): v for key, v in tensors.items()}
@@ -690,13 +678,6 @@ def load_loose(folder: str | Path) -> LooseGarment:
         network = VirtualBonesNet(inputs, len(arrays["bones"]), config)
         network.load_state_dict(state)
         name = str(stored["name"])
-    except (LookupError, TypeError, ValueError, RuntimeError) as error:
-        raise HeadError(
-            "garment",
-            f"a file that is no garment on virtual bones ({type(error).__name__})",
-            "use a folder that `skinlib garment train` wrote",
-            path,
-        ) from error
     cut = read_garment(folder / GARMENT)
     cut = Garment(cut.vertices, cut.faces, cut.pinned, name)
     garment = LooseGarment(read_body(folder / BODY), cut, network.eval(), **arrays)

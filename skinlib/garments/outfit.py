@@ -29,9 +29,8 @@ from skinlib.head import HeadError
 from skinlib.painting import limit_influences
 from skinlib.training.checkpoint import (
     CONFIG,
-    STATE,
     WEIGHTS,
-    read_tensors,
+    reading_finished,
     replace_file,
     write_tensors,
 )
@@ -297,31 +296,14 @@ def load_outfit(folder: str | Path) -> tuple[Outfit, PBNS]:
         HeadError: there is none, it is not finished, or a file is damaged.
     """
     folder = Path(folder)
-    if not (folder / WEIGHTS).is_file():
-        unfinished = (folder / STATE).is_file()
-        raise HeadError(
-            "outfit",
-            "its training has not ended" if unfinished else "there is no such file",
-            "run the same `skinlib garment train` again"
-            if unfinished
-            else "give a folder that `skinlib garment train --out` wrote",
-            folder / WEIGHTS,
-        )
-    tensors, metadata = read_tensors(folder / WEIGHTS)
-    try:
+    command = "skinlib garment train"
+    with reading_finished(folder, "outfit", "outfit", command) as (tensors, metadata):
         stored = json.loads(metadata["config"])
         config = PBNSConfig(**BEFORE | stored["network"])
         names = list(zip(stored["garments"], stored["names"], strict=True))
         buffers = [tensors[key].numpy() for key in PBNS.BUFFERS]
         network = PBNS(*buffers, config)
         network.load_state_dict(tensors)
-    except (LookupError, TypeError, ValueError, RuntimeError) as error:
-        raise HeadError(
-            "outfit",
-            f"a file that is no outfit ({type(error).__name__})",
-            "use a folder that `skinlib garment train` wrote",
-            folder / WEIGHTS,
-        ) from error
     garments = tuple(
         replace(read_garment(folder / Path(name).name), name=str(label))
         for name, label in names

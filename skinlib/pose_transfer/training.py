@@ -21,9 +21,8 @@ from skinlib.pose_transfer.losses import EDGE_WEIGHT, pose_loss
 from skinlib.pose_transfer.networks import NETWORKS
 from skinlib.training.checkpoint import (
     CONFIG,
-    STATE,
     WEIGHTS,
-    read_tensors,
+    reading_finished,
     replace_file,
     write_tensors,
 )
@@ -218,28 +217,13 @@ def load_network(name: str | Path) -> tuple[nn.Module, dict]:
     folder = Path(name)
     if not folder.exists() and str(name) == folder.name:
         folder = checkpoint(folder.name)
-    path = folder / WEIGHTS
-    if not path.is_file():
-        unfinished = (folder / STATE).is_file()
-        raise HeadError(
-            "model",
-            "its training has not ended" if unfinished else "there is no such file",
-            "run the same `skinlib pose train` again"
-            if unfinished
-            else "give a folder that `skinlib pose train --out` wrote",
-            path,
-        )
-    tensors, metadata = read_tensors(path)
-    try:
+    command = "skinlib pose train"
+    with reading_finished(folder, "model", "pose transfer", command) as (
+        tensors,
+        metadata,
+    ):
         told = json.loads(metadata["config"])
         kind, config = NETWORKS[told["pose transfer"]]
         network = kind(config(**told["settings"]))
         network.load_state_dict(tensors)
-    except (LookupError, TypeError, ValueError, RuntimeError) as error:
-        raise HeadError(
-            "model",
-            f"a file that is no pose transfer ({type(error).__name__})",
-            "use a folder that `skinlib pose train` wrote",
-            path,
-        ) from error
     return network.eval(), told

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
@@ -83,6 +84,44 @@ def load_model(name: str | Path) -> SkinningModel:
             path,
         ) from error
     return model.eval()
+
+
+@contextlib.contextmanager
+def reading_finished(
+    folder: Path, field: str, kind: str, command: str
+) -> Iterator[tuple[dict[str, Tensor], dict[str, str]]]:
+    """Tensors and metadata of what a finished run left in a folder.
+
+    What goes wrong in the block, while something is made of them, is told as a file
+    that is damaged or of another kind.
+
+    Args:
+        field: for the message. kind: "outfit". command: that writes such folders.
+
+    Raises:
+        HeadError: there is none, the run has not ended, or the file is damaged.
+    """
+    path = folder / WEIGHTS
+    if not path.is_file():
+        unfinished = (folder / STATE).is_file()
+        raise HeadError(
+            field,
+            "its training has not ended" if unfinished else "there is no such file",
+            f"run the same `{command}` again"
+            if unfinished
+            else f"give a folder that `{command} --out` wrote",
+            path,
+        )
+    tensors, metadata = read_tensors(path)
+    try:
+        yield tensors, metadata
+    except (LookupError, TypeError, ValueError, RuntimeError) as error:
+        raise HeadError(
+            field,
+            f"a file that is no {kind} ({type(error).__name__})",
+            f"use a folder that `{command}` wrote",
+            path,
+        ) from error
 
 
 def write_tensors(
