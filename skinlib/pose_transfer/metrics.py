@@ -54,7 +54,7 @@ def chamfer(a: np.ndarray, b: np.ndarray) -> float:
     >>> chamfer(np.array([[0.0, 0, 0]]), np.array([[0.0, 0, 1], [0, 0, 2]]))
     3.5
     """
-    a, b = _points(a), _points(b)
+    a, b = checked_points(a), checked_points(b)
     there, back = cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
     return float((there**2).mean() + (back**2).mean())
 
@@ -81,7 +81,7 @@ def earth_mover(
     >>> earth_mover(pair, np.array([[1.0, 0, 0], [0, 0, 2]]))
     1.0
     """
-    a, b = _points(a), _points(b)
+    a, b = checked_points(a), checked_points(b)
     if points < 1:
         raise HeadError("points", f"there are {points}", "match one or more")
     size = min(points, len(a), len(b))
@@ -193,7 +193,12 @@ def mean_scores(scores: Sequence[Scores]) -> Scores:
     return Scores(**{name: float(np.mean([r[name] for r in rows])) for name in rows[0]})
 
 
-def _points(points: np.ndarray) -> np.ndarray:
+def checked_points(points: np.ndarray) -> np.ndarray:
+    """(N, 3) float64, one or more, all of them finite.
+
+    Raises:
+        HeadError: they are not.
+    """
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise HeadError(
@@ -205,7 +210,7 @@ def _points(points: np.ndarray) -> np.ndarray:
 
 
 def _in_one_order(predicted, truth) -> tuple[np.ndarray, np.ndarray]:
-    predicted, truth = _points(predicted), _points(truth)
+    predicted, truth = checked_points(predicted), checked_points(truth)
     if predicted.shape != truth.shape:
         raise HeadError(
             "points",

@@ -32,6 +32,7 @@ from skinlib.garments.body import Body
 from skinlib.garments.motion import Motion
 from skinlib.geometry import row_dot
 from skinlib.head import Head, HeadError, Skeleton
+from skinlib.pose_transfer.metrics import checked_points
 from skinlib.skinning import descendants, forward_kinematics, linear_blend_skinning
 
 ITERATIONS = 60
@@ -515,13 +516,7 @@ def _shaped_skeleton(body: Body, amounts: np.ndarray) -> Skeleton:
 
 
 def _checked(points: np.ndarray) -> np.ndarray:
-    points = np.asarray(points, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
-        raise HeadError(
-            "points", f"an array of shape {points.shape}", "give (N, 3), N > 0"
-        )
-    if not np.isfinite(points).all():
-        raise HeadError("points", "they hold NaN or infinity", "give finite values")
+    points = checked_points(points)
     if not np.ptp(points, axis=0).any():
         raise HeadError("points", "all of them are at one place", "give a mesh")
     return points
