@@ -109,6 +109,7 @@ def test_people_who_share_no_mesh(tmp_path):
     "change, field",
     [
         ({"identities": 0}, "identities"),
+        ({"identities": 1001}, "identities: 1001. Give 1000 or fewer"),
         ({"judges": 0}, "judges"),
         ({"poses": 0}, "poses"),
         ({"seed": -1}, "seed"),

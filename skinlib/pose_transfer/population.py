@@ -55,12 +55,14 @@ class Population:
     """What is learnt, and what it is judged by. Everything follows from the seed.
 
     Raises:
-        HeadError: numbers below 1, or a negative seed.
+        HeadError: numbers below 1, a negative seed, or so many identities that those
+            who judge would be among them.
     """
 
     people: str = "shipped"
     """`shipped`: the shipped body in random shapes; `anny`: bodies of Anny's own
-    distribution; else a folder of skinned heads or bodies that share a mesh."""
+    distribution; else a folder of skinned heads or bodies that share a mesh; fewer than
+    four of them judge themselves."""
 
     vertices: tuple[int, ...] = (1229,)
     """Of each mesh that their surface is given, by edge collapse; sources and targets
@@ -79,6 +81,10 @@ class Population:
         for name, least in (("identities", 1), ("judges", 1), ("poses", 1)):
             if getattr(self, name) < least:
                 raise HeadError(name, f"{getattr(self, name)}", f"give {least} or more")
+        if self.identities > OTHERS:
+            raise HeadError(
+                "identities", f"{self.identities}", f"give {OTHERS} or fewer"
+            )
         if self.seed < 0:
             raise HeadError("seed", f"{self.seed}", "give 0 or more")
         for count in self.vertices:
