@@ -104,7 +104,7 @@ def meshes(network: nn.Module, native: Cast) -> Picture:
     images, titles = [], []
     for label, (cast, mesh) in other_meshes().items():
         pairs = PosePairs(native, cast, 20, 3, poses=UNSEEN).batch([SHOWN[1]])
-        posed = in_mesh_order(network(pairs.source, pairs.identity), pairs.order)[0]
+        posed = in_mesh_order(network(*pairs.inputs), pairs.order)[0]
         truth = in_mesh_order(pairs.truth, pairs.order)[0]
         off = 100 * np.linalg.norm(posed - truth, axis=-1) / pairs.height.item()
         images.append(draw(mesh, posed, off))
@@ -120,7 +120,7 @@ def noise(network: nn.Module, cast: Cast) -> Picture:
     for amount in (0.0, *NOISE):
         pairs = PosePairs(cast, cast, 20, 3, poses=UNSEEN, noise=amount)
         some = pairs.batch([SHOWN[1]])
-        posed = network(some.source, some.identity)
+        posed = network(*some.inputs)
         source = in_mesh_order(some.source, some.source_order)[0]
         rows[0].append(draw(mesh, source, colours=GIVEN))
         rows[1].append(draw(mesh, in_mesh_order(posed, some.order)[0]))
@@ -142,10 +142,10 @@ def dressed(cast: Cast) -> Picture:
     target = garments.dressed(outfit)
     colours = np.tile(garments.SKIN, (len(target.vertices), 1))
     colours[len(outfit.body.head.vertices) :] = garments.CLOTHS[0]
-    edges, size = mesh_edges(target.faces), (200, 224)
-    images = [draw(quick_mesh(), s, colours=GIVEN, size=size) for s in sources]
+    mesh, size = quick_mesh(), (200, 224)
+    images = [draw(mesh, s, colours=GIVEN, size=size) for s in sources]
     for source in sources:
-        posed = transfer_pose(network, source, target.vertices, edges)
+        posed = transfer_pose(network, mesh.replace(vertices=source), target)
         images.append(draw(target, normalised(posed)[0], colours=colours, size=size))
     rows = ["source", "target, moved"]
     return picture_grid(images, columns=len(sources), row_titles=rows)

@@ -12,7 +12,7 @@ import json
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import igl
@@ -69,6 +69,13 @@ ABLATIONS = {
     "SPAdaIN in place of each first FFAdaIN": {"settings": {"spadain_first": True}},
     "no side of the target": {"settings": {"target_side": False}},
     "no edges in the loss": {"edge_weight": 0.0},
+}
+LONG_RUNS = {
+    "dsffnet": {},
+    "npt": {},
+    "corenet": {},
+    "dsffnet_by_vertex": {"by_area": False},
+    "npt_by_area": {"by_area": True},
 }
 NOISE = (0.01, 0.02, 0.05)
 LONG = 4000  # steps of the narrow network that meshes and noise are tried on
@@ -196,19 +203,16 @@ def ablations(bench: Bench) -> dict:
 
 
 def long(bench: Bench) -> dict:
-    """Narrow networks for as long as a CPU allows; on three meshes, too."""
+    """Narrow networks for as long as a CPU allows."""
     found = {}
-    for name in NARROW:
-        network = bench.trained(f"long/{name}", QUICK, **narrow(name, steps=LONG))
-        found[name] = bench.judged(network, bench.tests(QUICK))
+    for run, changes in LONG_RUNS.items():
+        settings = narrow(run.partition("_")[0], steps=LONG, settings=changes)
+        network = bench.trained(f"long/{run}", QUICK, **settings)
+        found[run] = bench.judged(network, bench.tests(QUICK))
     # 3D-CoreNet's steps take three times as long, and time is what one has.
     settings = narrow("dsffnet", steps=3 * LONG)
     network = bench.trained("long/dsffnet_3x", QUICK, **settings)
     found["dsffnet, three times the steps"] = bench.judged(network, bench.tests(QUICK))
-    mixed = replace(QUICK, vertices=(369, 600, 900))
-    settings = narrow("dsffnet", steps=LONG)
-    network = bench.trained("long/mixed", mixed, **settings)
-    found["dsffnet, three meshes"] = bench.judged(network, bench.tests(QUICK))
     found["copy"] = bench.judged(None, bench.tests(QUICK))
     return found
 
@@ -217,7 +221,7 @@ def meshes(bench: Bench) -> dict:
     """Other meshes than those that were trained on, as targets and as sources."""
     casts, found = other_meshes(), {}
     native, _ = casts["native"]
-    for run in ("dsffnet", "npt", "corenet", "mixed"):
+    for run in LONG_RUNS:
         network, _ = load_network(bench.out / "long" / run)
         for label, (cast, _) in casts.items():
             kinds = {"target": (native, cast), "source": (cast, native)}
@@ -266,7 +270,7 @@ def noise(bench: Bench) -> dict:
     """Noise on the sources, for networks that learnt without it, and one with."""
     settings = narrow("dsffnet", steps=LONG)
     bench.trained("noise/learnt", QUICK, **settings, noise=0.02)
-    runs = {name: f"long/{name}" for name in NARROW} | {"learnt": "noise/learnt"}
+    runs = {run: f"long/{run}" for run in LONG_RUNS} | {"learnt": "noise/learnt"}
     found = {}
     for run, folder in runs.items():
         network, _ = load_network(bench.out / folder)
@@ -284,7 +288,7 @@ def shape(bench: Bench) -> dict:
         for label in ("seen", "unseen"):
             some = bench.tests(QUICK)[label][0].batch(range(200))
             with torch.inference_mode():
-                posed = network(some.source, some.identity)
+                posed = network(*some.inputs)
             for reach in (0.0, 0.03, 0.07, 0.15):
                 scores = []
                 for i, points in enumerate(posed.numpy()):
@@ -305,7 +309,7 @@ def skeleton(bench: Bench) -> dict:
     network, _ = load_network(bench.out / "long" / "dsffnet")
     pairs = bench.tests(QUICK)["unseen"][0].batch(range(40))
     with torch.inference_mode():
-        posed = network(pairs.source, pairs.identity).numpy()
+        posed = network(*pairs.inputs).numpy()
     found: dict[str, list[Scores]] = {}
     for i in tqdm(range(len(posed)), "through bones", unit="pair"):
         source, _, target, _ = pairs.who[i].tolist()
@@ -336,7 +340,7 @@ def contact(bench: Bench) -> dict:
     network, _ = load_network(bench.out / "long" / "dsffnet")
     pairs = bench.tests(QUICK)["unseen"][0].batch(range(200))
     with torch.inference_mode():
-        posed = network(pairs.source, pairs.identity)
+        posed = network(*pairs.inputs)
     rows = [
         (_doubled(p, f), _doubled(t, f))
         for p, t, f in zip(
@@ -369,9 +373,10 @@ class Unsupervised(TransferTrainer):
         batch = self.config.batch
         items = range(self.steps_done * batch, (self.steps_done + 1) * batch)
         pairs = self.pairs[0].batch(items)
-        posed = self.network(pairs.source, pairs.identity)
-        back = self.network(pairs.identity, posed)
-        still = self.network(pairs.identity, pairs.identity)
+        posed = self.network(*pairs.inputs)
+        own = pairs.share, pairs.share
+        back = self.network(pairs.identity, posed, *own)
+        still = self.network(pairs.identity, pairs.identity, *own)
         loss = (
             pose_reconstruction(back, pairs.identity)
             + pose_reconstruction(still, pairs.identity)
@@ -433,13 +438,14 @@ def speed(bench: Bench) -> dict:
     device = torch.device(bench.device)
     torch.set_num_threads(2)
     points = 2 * torch.rand(2, 1, 6890, 3, device=device) - 1
+    shares = points.new_full((2, 1, 6890), 1 / 6890)
     networks = {name: make_network(name, {}, 0).eval().to(device) for name in NETWORKS}
     times: dict[str, list[float]] = {name: [] for name in networks}
     with torch.inference_mode():
         for repeat in range(21):
             for name, network in networks.items():  # by turns, as machines drift
                 began = time.perf_counter()
-                network(*points)
+                network(*points, *shares)
                 if device.type == "cuda":
                     torch.cuda.synchronize()
                 if repeat:

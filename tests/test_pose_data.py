@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 import torch
 from test_body import small_body
+from test_energies import grid
 
 from skinlib.datasets.remesh import halve, shuffle, subdivide
 from skinlib.garments.body import Body, read_body
 from skinlib.garments.motion import Motion, random_poses
+from skinlib.geometry import vertex_areas
 from skinlib.head import Head, HeadError
 from skinlib.pose_transfer.data import (
     Cast,
@@ -19,6 +21,7 @@ from skinlib.pose_transfer.data import (
     on_mesh,
     restored,
     size_by_edges,
+    vertex_shares,
 )
 from skinlib.skinning import linear_blend_skinning
 
@@ -286,14 +289,64 @@ def test_noise_moves_the_source_by_a_share_of_its_box(noise):
     torch.testing.assert_close(clean.truth, noisy.truth)
     torch.testing.assert_close(clean.identity, noisy.identity)
     for before, after in zip(clean.source.numpy(), noisy.source.numpy(), strict=True):
-        # The noise moves the box a little besides, and makes it larger.
+        # The noise moves the sides of the box besides.
         grown = ((before - before.mean(0)) * (after - after.mean(0))).sum()
         grown /= ((before - before.mean(0)) ** 2).sum()
-        assert 1 - 2.1 * noise < grown < 1
+        assert abs(grown - 1) < 2.1 * noise
         moved = after / grown - before
         moved = (moved - moved.mean(axis=0)) / 2  # of the box, whose side is 2
         assert moved.std() == pytest.approx(noise / np.sqrt(3), rel=0.1)
         assert np.abs(moved).max() < 1.2 * noise
+
+
+def plane() -> tuple[torch.Tensor, torch.Tensor]:
+    """(1, 25, 3) and (F, 3): a square in 4 x 4 cells."""
+    vertices, faces = grid(4)
+    vertices = np.pad(vertices, ((0, 0), (0, 3 - vertices.shape[1])))
+    return torch.tensor(vertices, dtype=torch.float32)[None], torch.tensor(faces)
+
+
+def test_shares_are_areas_where_it_is_flat():
+    vertices, faces = plane()
+    shares = vertex_shares(vertices, faces)
+    assert shares.sum().item() == pytest.approx(1, abs=1e-6)
+    expected = vertex_areas(vertices[0].numpy(), faces.numpy())
+    np.testing.assert_allclose(shares[0], expected / expected.sum(), atol=1e-6)
+
+
+def test_noise_on_a_vertex_does_not_change_its_share():
+    """Its rim alone decides; the area of the triangles around it grows."""
+    vertices, faces = plane()
+    middle, moved = 12, vertices.clone()
+    moved[0, middle] += torch.tensor([0.02, -0.01, 0.2])
+    both = [vertex_shares(v, faces)[0] for v in (vertices, moved)]
+    share, other = (shares[middle] / shares[0] for shares in both)
+    assert other.item() == pytest.approx(share.item(), rel=1e-5)
+    areas = [vertex_areas(v[0].numpy(), faces.numpy()) for v in (vertices, moved)]
+    assert areas[1][middle] > 1.1 * areas[0][middle]
+
+
+def test_shares_of_what_has_no_area():
+    line = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]])
+    shares = vertex_shares(line, torch.tensor([[0, 1, 2]]))
+    torch.testing.assert_close(shares, torch.full((1, 3), 1 / 3))
+    none = vertex_shares(line, torch.zeros((0, 3), dtype=torch.int64))
+    torch.testing.assert_close(none, torch.full((1, 3), 1 / 3))
+
+
+def test_pairs_tell_the_shares_in_their_order():
+    many = PosePairs(POST_CAST, POST_CAST, 4).batch(range(4))
+    own = vertex_shares(many.identity, POST_CAST.faces)
+    for i in range(4):
+        inverse = many.order[i].argsort()
+        mesh = many.identity[i][inverse][None]
+        expected = vertex_shares(mesh, POST_CAST.faces)[0]
+        torch.testing.assert_close(many.share[i][inverse], expected)
+        back = many.source[i][many.source_order[i].argsort()][None]
+        expected = vertex_shares(back, POST_CAST.faces)[0]
+        torch.testing.assert_close(many.source_share[i], expected[many.source_order[i]])
+    assert not torch.allclose(own, many.share)  # the triangles are those of the mesh
+    assert all(a is b for a, b in zip(many.inputs, many[:2], strict=False))
 
 
 def test_source_and_identity_on_different_meshes():

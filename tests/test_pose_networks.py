@@ -20,12 +20,13 @@ from skinlib.pose_transfer.networks import (
     NPTConfig,
     SPAdaIN,
     cosine_correlation,
+    instance_norm,
     optimal_transport,
     parameter_kb,
 )
 
 TINY = {
-    "dsffnet": DSFFNetConfig(width=32, encoder=8),
+    "dsffnet": DSFFNetConfig(width=32, encoder=8, by_area=False),
     "npt": NPTConfig(width=32, encoder=8),
     "corenet": CoreNetConfig(width=32),
 }
@@ -220,8 +221,7 @@ def test_dsffnet_is_the_repeated_form(changes, source, identity):
     net = network("dsffnet", **changes)
     v, code = identity.mT, net.encode(source)
     x = source.mT
-    for index in (0, 3, 6):
-        conv = net.encoder[index]
+    for conv in net.encoder.convs:
         x = F.relu(nn.InstanceNorm1d(conv.out_channels)(conv(x)))
     assert (x.amax(2, keepdim=True) - code).abs().max() < 1e-5
     h = v
@@ -266,6 +266,57 @@ def test_nothing_is_as_large_as_a_repeated_code(source, identity):
     assert (64, 37) in sizes and (67, 37) not in sizes
 
 
+# --- the surface counts, not the vertices ---------------------------------------------
+
+
+def test_vertices_of_one_share_are_plain_instance_normalisation():
+    h = torch.randn(2, 6, 40, generator=torch.manual_seed(0))
+    plain = F.instance_norm(h, eps=networks.EPS)
+    for share in (None, torch.full((2, 40), 1 / 40)):
+        assert (instance_norm(h, share) - plain).abs().max() < 1e-5
+
+
+def test_instance_norm_by_hand_and_by_differences():
+    h = torch.tensor([[[0.0, 3, 6]]], dtype=torch.double)
+    share = torch.tensor([[0.5, 0.25, 0.25]], dtype=torch.double)
+    mean, variance = 2.25, 0.5 * 2.25**2 + 0.25 * 0.75**2 + 0.25 * 3.75**2
+    expected = (h - mean) / (variance + networks.EPS) ** 0.5
+    assert (instance_norm(h, share) - expected).abs().max() < 1e-12
+    assert gradcheck(lambda x: instance_norm(x, share), h.requires_grad_())
+
+
+@pytest.mark.parametrize("name", ["dsffnet", "npt"])
+def test_a_vertex_in_pieces_counts_as_one(name, source, identity):
+    """Seven copies that have a seventh each change nothing, and change the mean."""
+    copies = [0] * 6 + [*range(37)]
+    shares = torch.rand(2, 37, generator=torch.manual_seed(3)).softmax(dim=1)
+    pieces = shares[:, copies]
+    pieces[:, [0, 1, 2, 3, 4, 5, 6]] = shares[:, :1] / 7
+    for by_area in (True, False):
+        net = network(name, by_area=by_area)
+        for give in (
+            lambda p, s: (source, p, shares.new_full((2, 50), 0.02), s),
+            lambda p, s: (p, identity, s, shares),
+        ):
+            one = net(*give(identity, shares))
+            many = net(*give(identity[:, copies], pieces))[:, -37:]
+            assert ((one - many).abs().max() < 1e-5) == by_area
+
+
+@pytest.mark.parametrize("name", ["dsffnet", "npt"])
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [
+        (None, "it is absent"),
+        (torch.ones(2, 36), r"\(2, 36\) for a identity of \(2, 37, 3\)"),
+    ],
+)
+def test_shares_that_are_not_there(name, share, words, source, identity):
+    theirs = torch.full((2, 50), 0.02)
+    with pytest.raises(HeadError, match=f"share: .*{words}"):
+        network(name, by_area=True)(source, identity, theirs, share)
+
+
 # --- what FFAdaIN is for --------------------------------------------------------------
 
 
@@ -308,7 +359,7 @@ def test_alpha_and_beta_start_where_they_are_told():
 def test_only_alpha_0_keeps_the_gradient_from_the_encoder(alpha_init, source, identity):
     net = network("dsffnet", alpha_init=alpha_init)
     net(source, identity).square().mean().backward()
-    slope = max(p.grad.abs().max() for p in net.encoder[6].parameters())
+    slope = max(p.grad.abs().max() for p in net.encoder.convs[2].parameters())
     assert (slope == 0) == (alpha_init == 0)
     assert net.blocks[0].first.alpha.grad != 0
 

@@ -280,9 +280,9 @@ def test_every_second_step_is_in_a_mirror(tmp_path):
     network, given = trainer.network, []
 
     class Noted(torch.nn.Module):
-        def forward(self, source, identity):
+        def forward(self, source, identity, *shares):
             given.append((source, identity))
-            return network(source, identity)
+            return network(source, identity, *shares)
 
     trainer.network = Noted()
     told = [trainer.step() for _ in range(2)]
@@ -295,7 +295,7 @@ def test_every_second_step_is_in_a_mirror(tmp_path):
         pairs = PosePairs(POSTS, POSTS, 8)
         first = make_network("dsffnet", SMALL, 0)
         items = pairs.batch(range(8))
-        off = first(items.source, items.identity) - items.truth
+        off = first(*items.inputs) - items.truth
     assert told[0]["PMD e-4"] == pytest.approx(
         1e4 * off.square().mean().item(), rel=1e-4
     )
@@ -355,7 +355,8 @@ def test_a_network_is_kept_with_what_is_told_of_it(tmp_path, name):
     assert parameter_kb(loaded) == parameter_kb(network) and told["seconds"] == 3
     points = torch.rand(1, 20, 3) * 2 - 1
     with torch.inference_mode():
-        assert torch.equal(loaded(points, points), network(points, points))
+        given = points, points, *torch.full((2, 1, 20), 1 / 20)
+        assert torch.equal(loaded(*given), network(*given))
 
 
 def test_folders_without_a_network(tmp_path):
@@ -382,22 +383,36 @@ MESH = trimesh.creation.icosphere(2)
 EDGES = mesh_edges(np.asarray(MESH.faces))
 
 
+def at(vertices, order=None) -> trimesh.Trimesh:
+    """The mesh with its vertices elsewhere, and in another order."""
+    order = np.arange(len(vertices)) if order is None else order
+    faces = np.argsort(order)[MESH.faces]
+    return trimesh.Trimesh(vertices[order], faces, process=False)
+
+
+def points(vertices) -> trimesh.Trimesh:
+    """As many of the triangles as these vertices can have."""
+    faces = MESH.faces[(MESH.faces < len(vertices)).all(axis=1)]
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
 def test_a_mesh_in_its_own_pose_stays_as_it_is():
     order = np.random.default_rng(0).permutation(len(MESH.vertices))
-    for source in (MESH.vertices, MESH.vertices[order], 3 * MESH.vertices + 1):
-        posed = transfer_pose(NETWORK, source, MESH.vertices, EDGES)
+    larger = at(3 * MESH.vertices + 1)
+    for source in (MESH, at(MESH.vertices, order), larger):
+        posed = transfer_pose(NETWORK, source, MESH)
         np.testing.assert_array_equal(posed, MESH.vertices.astype(np.float32))
 
 
 def test_the_result_stands_where_the_target_stood_in_its_size():
-    source = MESH.vertices * [1, 2, 3]
-    here = transfer_pose(NETWORK, source, MESH.vertices, EDGES)
-    there = transfer_pose(NETWORK, source, 100 * MESH.vertices + [5, 6, 7], EDGES)
+    source = at(MESH.vertices * [1, 2, 3])
+    here = transfer_pose(NETWORK, source, MESH)
+    there = transfer_pose(NETWORK, source, at(100 * MESH.vertices + [5, 6, 7]))
     np.testing.assert_allclose(there, 100 * here + [5, 6, 7], atol=2e-2)
     assert abs(here[:, 2].min() - MESH.vertices[:, 2].min()) < 1e-6
     middle = (here.min(0) + here.max(0)) / 2
     np.testing.assert_allclose(middle[:2], 0, atol=1e-6)
-    raw = transfer_pose(NETWORK, source, MESH.vertices, EDGES, reach=0)
+    raw = transfer_pose(NETWORK, source, MESH, reach=0)
     lengths = [
         np.linalg.norm(p[EDGES[:, 0]] - p[EDGES[:, 1]], axis=1)
         for p in (raw, MESH.vertices)
@@ -409,11 +424,10 @@ def test_the_result_stands_where_the_target_stood_in_its_size():
 
 def test_the_order_of_vertices_does_not_matter():
     rng = np.random.default_rng(1)
-    source, target = MESH.vertices * [1, 2, 3], MESH.vertices
-    posed = transfer_pose(NETWORK, source, target, EDGES)
-    a, b = (rng.permutation(len(target)) for _ in range(2))
-    place = np.argsort(b)
-    again = transfer_pose(NETWORK, source[a], target[b], place[EDGES])
+    source = MESH.vertices * [1, 2, 3]
+    posed = transfer_pose(NETWORK, at(source), MESH)
+    a, b = (rng.permutation(len(source)) for _ in range(2))
+    again = transfer_pose(NETWORK, at(source, a), at(MESH.vertices, b))
     np.testing.assert_allclose(again, posed[b], atol=1e-5)
 
 
@@ -428,7 +442,7 @@ def test_the_order_of_vertices_does_not_matter():
 )
 def test_meshes_that_have_no_pose(source, target, words):
     with pytest.raises(HeadError, match=words):
-        transfer_pose(NETWORK, source, target, EDGES)
+        transfer_pose(NETWORK, points(source), points(target))
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj", ".ply", ".stl"])
@@ -458,7 +472,7 @@ def test_a_file_is_posed_with_its_triangles_and_texture(tmp_path):
         NETWORK, *(tmp_path / f for f in ("source.glb", "target.obj", "o.obj"))
     )
     posed = read_mesh(tmp_path / "o.obj")
-    expected = transfer_pose(NETWORK, source.vertices, MESH.vertices, EDGES)
+    expected = transfer_pose(NETWORK, source, MESH)
     np.testing.assert_allclose(posed.vertices, expected, atol=1e-5)
     np.testing.assert_array_equal(posed.faces, MESH.faces)
     np.testing.assert_allclose(posed.visual.uv, uv, atol=1e-5)
@@ -487,7 +501,7 @@ def test_bad_files_are_named_and_nothing_is_written(tmp_path):
 
 def test_the_judge_sees_the_truth_and_a_copy():
     class Truth(torch.nn.Module):
-        def forward(self, source, identity):
+        def forward(self, *given):
             return self.truth
 
     test = PosePairs(POSTS, POSTS, 6)

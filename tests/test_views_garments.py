@@ -48,6 +48,18 @@ def fallback(monkeypatch):
     scenes.backend.cache_clear()
 
 
+def test_sizes_are_drawn_on_their_bodies():
+    learnt = outfit().network(PBNSConfig(8, 4), smoothing=10, shapes=True, seed=0)
+
+    def drawn(**shapes):
+        found = garments.sizes(outfit(), learnt, rest(), shapes, size=SMALL)
+        return np.asarray(found)
+
+    assert np.array_equal(drawn(a={}), drawn(a={}))
+    assert not np.array_equal(drawn(a={"height": 1.0}), drawn(a={}))
+    assert drawn(a={}, b={}, c={}).shape[1] > 2 * drawn(a={}).shape[1]
+
+
 def rest() -> Motion:
     return garments.posture(outfit(), elbow=0.0)
 

@@ -261,6 +261,29 @@ def normalised(points: Array) -> tuple[Array, Array, Array]:
     return (points - centre) / scale, centre, scale
 
 
+def vertex_shares(points: Tensor, faces: Tensor) -> Tensor:
+    """(B, N) which part of the surface is around each vertex; they sum to 1.
+
+    The normals of the triangles around it, as long as their areas, are added, and the
+    length of the sum counts: where the surface is flat, its area. Noise adds to areas,
+    but not to this sum, which the rim of the ring alone decides. Without any area, all
+    vertices have the same. Equation `vertex_shares`.
+
+    Args:
+        points: (B, N, 3), in any unit. faces: (F, 3) int64, wound alike.
+
+    >>> points = torch.tensor([[[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [0, -1, 0]]])
+    >>> vertex_shares(points, torch.tensor([[0, 1, 2], [0, 3, 1]])) * 9
+    tensor([[3., 3., 2., 1.]])
+    """
+    a, b, c = (points[:, faces[:, corner]] for corner in range(3))
+    normals = torch.linalg.cross(b - a, c - a).repeat_interleave(3, dim=1)
+    sums = torch.zeros_like(points).index_add_(1, faces.flatten(), normals)
+    shares = sums.norm(dim=2)
+    whole = shares.sum(dim=1, keepdim=True)
+    return torch.where(whole > 0, shares / whole, 1 / points.shape[1])
+
+
 def restored(points: Array, centre: Array, scale: Array) -> Array:
     """Normalised points in their own unit and place: the way back of `normalised`."""
     return points * scale + centre
@@ -391,6 +414,7 @@ class Pairs(NamedTuple):
         faces: (B, F, 3) and edges: (B, E, 2) of identity and truth, in that order.
         centre: (B, 1, 3) and scale: (B, 1, 1) of the truth in metres, for `restored`.
         height: (B,) of the standing identity in the truth's normalised unit.
+        source_share: (B, M) and share: (B, N) of source and identity, `vertex_shares`.
         source_order: (B, M) and order: (B, N), which vertex of the mesh each one is.
         who: (B, 4) the source's identity and pose, the target's identity and its pose;
             -1 for the rest pose.
@@ -404,9 +428,16 @@ class Pairs(NamedTuple):
     centre: Tensor
     scale: Tensor
     height: Tensor
+    source_share: Tensor
+    share: Tensor
     source_order: Tensor
     order: Tensor
     who: Tensor
+
+    @property
+    def inputs(self) -> tuple[Tensor, ...]:
+        """What a network is given: points of both, and their shares of the surface."""
+        return self.source, self.identity, self.source_share, self.share
 
 
 class PosePairs(torch.utils.data.Dataset):
@@ -489,12 +520,15 @@ class PosePairs(torch.utils.data.Dataset):
             torch.as_tensor(x, device=device) for x in (source_order, order)
         )
         somebody, pose, other, own_pose = who.T.copy()
-        source = _taken(self.sources.posed(somebody, pose), source_order)
+        source = self.sources.posed(somebody, pose)
+        identity = self.targets.posed(other, own_pose)
         if self.noise:
             sides = source.amax(1) - source.amin(1)
             amount = self.noise * sides.amax(1)[:, None, None]
             source = source + amount * torch.as_tensor(offset, device=device)
-        identity = _taken(self.targets.posed(other, own_pose), order)
+        source_share = vertex_shares(source, self.sources.faces)
+        share = vertex_shares(identity, self.targets.faces)
+        source, identity = _taken(source, source_order), _taken(identity, order)
         truth = _taken(self.targets.posed(other, pose), order)
         truth, centre, scale = normalised(truth)
         place = order.argsort(dim=1)
@@ -512,6 +546,8 @@ class PosePairs(torch.utils.data.Dataset):
             centre,
             scale,
             self.targets.heights[who[:, 2]] / scale[:, 0, 0],
+            source_share.gather(1, source_order),
+            share.gather(1, order),
             source_order,
             order,
             who,

@@ -38,12 +38,18 @@ EPS = 1e-5  # in the root of a variance, as in InstanceNorm1d
 # --- what they share ------------------------------------------------------------------
 
 
-def _check_points(source: Tensor, identity: Tensor) -> None:
+def _check_points(
+    source: Tensor,
+    identity: Tensor,
+    source_share: Tensor | None,
+    share: Tensor | None,
+) -> None:
     """Fit for a network, or `HeadError`.
 
     A captured or compiled step cannot look at its numbers, and is not checked for NaN.
     """
-    for name, points in {"source": source, "identity": identity}.items():
+    both = {"source": (source, source_share), "identity": (identity, share)}
+    for name, (points, part) in both.items():
         if points.dim() != 3 or points.shape[2] != 3:
             raise HeadError(name, f"shape {tuple(points.shape)}", "give (B, N, 3)")
         if points.shape[1] < 2:
@@ -52,6 +58,12 @@ def _check_points(source: Tensor, identity: Tensor) -> None:
                 f"{points.shape[1]} vertices, and fewer than two have no spread to "
                 "normalise by",
                 "give two or more",
+            )
+        if part is not None and part.shape != points.shape[:2]:
+            raise HeadError(
+                "share",
+                f"shape {tuple(part.shape)} for a {name} of {tuple(points.shape)}",
+                "give one number for each vertex",
             )
     if len(source) != len(identity) or not len(source):
         raise HeadError(
@@ -69,6 +81,17 @@ def _check_points(source: Tensor, identity: Tensor) -> None:
             raise HeadError(
                 name, f"{bad} coordinates are NaN or infinite", "give finite points"
             )
+
+
+def _counted(share: Tensor | None, by_area: bool) -> Tensor | None:
+    """What `instance_norm` counts the vertices by."""
+    if by_area and share is None:
+        raise HeadError(
+            "share",
+            "it is absent, and the network counts each vertex by its area",
+            "give vertex_shares(points, faces), or set by_area=False",
+        )
+    return share if by_area else None
 
 
 def _check_channels(name: str, channels: int, factor: int = 1) -> None:
@@ -105,8 +128,30 @@ def _mixed(conv: nn.Conv1d, code: Tensor) -> tuple[Tensor, Tensor]:
     )
 
 
-class PoseEncoder(nn.Sequential):
-    """(B, 3, M) -> (B, width, M): three times Conv1d, InstanceNorm1d, ReLU.
+def instance_norm(h: Tensor, share: Tensor | None = None) -> Tensor:
+    """(B, C, N): (h - mean) / std of each channel over the vertices.
+
+    Vertices are dense where a mesh was made so, and their mean is the mesh's as much as
+    the shape's. With each vertex counted by its share of the surface the mean is the
+    surface's. Equation `instance_norm`.
+
+    Args:
+        h: (B, C, N). share: (B, N), sums to 1; all the same when absent.
+
+    >>> h = torch.tensor([[[0.0, 0, 0, 4]]])  # three vertices at one place
+    >>> share = torch.tensor([[1.0, 1, 1, 3]]) / 6
+    >>> instance_norm(h, share).round()
+    tensor([[[-1., -1., -1.,  1.]]])
+    """
+    if share is None:
+        return F.instance_norm(h, eps=EPS)
+    share = share[..., None]
+    centred = h - h @ share
+    return centred * (centred.square() @ share + EPS).rsqrt()
+
+
+class PoseEncoder(nn.Module):
+    """(B, 3, M) -> (B, width, M): three times convolution, `instance_norm`, ReLU.
 
     Args:
         first: channels of the first group; the second has twice as many.
@@ -115,10 +160,14 @@ class PoseEncoder(nn.Sequential):
 
     def __init__(self, first: int, width: int):
         super().__init__()
-        channels = (3, first, 2 * first, width)
-        for a, b in pairwise(channels):
-            self.append(nn.Conv1d(a, b, 1)).append(nn.InstanceNorm1d(b, eps=EPS))
-            self.append(nn.ReLU())
+        channels = pairwise((3, first, 2 * first, width))
+        self.convs = nn.ModuleList(nn.Conv1d(a, b, 1) for a, b in channels)
+
+    def forward(self, x: Tensor, share: Tensor | None = None) -> Tensor:
+        """share: (B, M), as for `instance_norm`."""
+        for conv in self.convs:
+            x = instance_norm(conv(x), share).relu_()
+        return x
 
 
 # --- SPAdaIN and FFAdaIN --------------------------------------------------------------
@@ -155,12 +204,14 @@ class SPAdaIN(nn.Module):
         h: Tensor,
         points: Tensor,
         code: Tensor,
+        share: Tensor | None = None,
         then: Callable[[Tensor], Tensor] = lambda x: x,
     ) -> Tensor:
         """(B, C', N): `then` of h', computed some vertices at a time.
 
         Args:
             h: (B, C, N). points: (B, 3, N). code: (B, Z, 1), which only FFAdaIN reads.
+            share: (B, N), as for `instance_norm`.
             then: maps (B, C, n) to (B, C', n), each vertex by itself.
         """
         scale, scale_bias, shift, shift_bias = self.sides(code)
@@ -170,7 +221,7 @@ class SPAdaIN(nn.Module):
             delta = _affine(shift, shift_bias, points)
             return then(torch.addcmul(delta, gamma, h))
 
-        h = F.instance_norm(h, eps=EPS) if self.normalise else h
+        h = instance_norm(h, share) if self.normalise else h
         return _by_columns(modulate, h, points)
 
 
@@ -238,10 +289,13 @@ class FFAdaINBlock(nn.Module):
         self.conv1 = nn.Conv1d(channels, channels, 1)
         self.conv2 = nn.Conv1d(channels, channels, 1)
 
-    def forward(self, h: Tensor, points: Tensor, code: Tensor) -> Tensor:
-        """(B, C, N), (B, 3, N), (B, Z, 1) -> (B, C, N)."""
-        x1 = self.first(h, points, code, lambda x: self.conv1(x.relu_()))
-        return x1 + self.second(x1, points, code, lambda x: self.conv2(x.relu_()))
+    def forward(
+        self, h: Tensor, points: Tensor, code: Tensor, share: Tensor | None = None
+    ) -> Tensor:
+        """(B, C, N), (B, 3, N), (B, Z, 1), (B, N) -> (B, C, N)."""
+        x1 = self.first(h, points, code, share, lambda x: self.conv1(x.relu_()))
+        x2 = self.second(x1, points, code, share, lambda x: self.conv2(x.relu_()))
+        return x1 + x2
 
 
 @dataclass(frozen=True)
@@ -258,6 +312,7 @@ class DSFFNetConfig:
     alpha_init: float = 0.5  # of alpha and beta; the source: 0
     spadain_first: bool = False  # in each block, SPAdaIN in place of the first FFAdaIN
     target_side: bool = True  # the side of FFAdaIN that reads the identity alone
+    by_area: bool = True  # means over the surface; the source: over the vertices
 
     def __post_init__(self):
         _check_channels("width", self.width, 4)
@@ -318,32 +373,45 @@ class DSFFNet(nn.Module):
         ]
         return torch.stack(pairs).detach() if pairs else torch.zeros(0, 2)
 
-    def encode(self, source: Tensor) -> Tensor:
-        """(B, Z, 1) the code of a pose, from (B, M, 3)."""
-        return self.encoder(source.mT).amax(dim=2, keepdim=True)
+    def encode(self, source: Tensor, share: Tensor | None = None) -> Tensor:
+        """(B, Z, 1) the code of a pose, from (B, M, 3) and (B, M)."""
+        share = _counted(share, self.config.by_area)
+        return self.encoder(source.mT, share).amax(dim=2, keepdim=True)
 
-    def forward(self, source: Tensor, identity: Tensor) -> Tensor:
+    def forward(
+        self,
+        source: Tensor,
+        identity: Tensor,
+        source_share: Tensor | None = None,
+        share: Tensor | None = None,
+    ) -> Tensor:
         """(B, N, 3) the identity in the pose of the source, in the identity's order.
 
         Args:
             source: (B, M, 3), identity: (B, N, 3), each in [-1, 1].
+            source_share: (B, M), share: (B, N): which part of the surface is around
+                each vertex, `vertex_shares`; needed if the configuration says
+                `by_area`, and else not read.
 
         Raises:
             HeadError: fewer than two vertices, which instance normalisation cannot
-                tell from their mean; NaN; shapes that do not fit.
+                tell from their mean; NaN; shapes that do not fit; no shares, if needed.
         """
-        _check_points(source, identity)
-        return self.decode(self.encode(source), identity)
+        _check_points(source, identity, source_share, share)
+        return self.decode(self.encode(source, source_share), identity, share)
 
-    def decode(self, code: Tensor, identity: Tensor) -> Tensor:
+    def decode(
+        self, code: Tensor, identity: Tensor, share: Tensor | None = None
+    ) -> Tensor:
         """(B, N, 3) the identity, (B, N, 3), in the pose of a code, (B, Z, 1).
 
         A code need not come from a mesh: any mixture of two is one.
         """
+        share = _counted(share, self.config.by_area)
         points = identity.mT.contiguous()
         h = points
         for conv, block in zip(self.convs, self.blocks, strict=False):
-            h = block(conv(h), points, code)
+            h = block(conv(h), points, code, share)
         return (2 * self.convs[-1](h).tanh()).mT
 
 
@@ -362,12 +430,14 @@ class SPAdaINBlock(nn.Module):
         self.norms = nn.ModuleList(SPAdaIN(channels, normalise) for _ in range(3))
         self.convs = nn.ModuleList(nn.Conv1d(channels, channels, 1) for _ in range(3))
 
-    def forward(self, h: Tensor, points: Tensor, code: Tensor) -> Tensor:
-        """(B, C, N), (B, 3, N), (B, Z, 1 or N) -> (B, C, N)."""
+    def forward(
+        self, h: Tensor, points: Tensor, code: Tensor, share: Tensor | None = None
+    ) -> Tensor:
+        """(B, C, N), (B, 3, N), (B, Z, 1 or N), (B, N) -> (B, C, N)."""
 
         def step(index, x):
             conv = self.convs[index]
-            return self.norms[index](x, points, code, lambda x: conv(x.relu_()))
+            return self.norms[index](x, points, code, share, lambda x: conv(x.relu_()))
 
         return step(1, step(0, h)) + step(2, h)
 
@@ -383,6 +453,7 @@ class NPTConfig:
     width: int = 1024  # of the pose code
     encoder: int = 64  # channels of the encoder's first group
     pool: bool = True  # one code a mesh; else one a vertex, and then M has to be N
+    by_area: bool = False  # means over the surface; the paper: over the vertices
 
     def __post_init__(self):
         _check_channels("width", self.width, 4)
@@ -420,21 +491,27 @@ class NPT(nn.Module):
         """The configuration, as plain values."""
         return asdict(self.config)
 
-    def encode(self, source: Tensor) -> Tensor:
-        """(B, Z, 1), or (B, Z, M) where it is not pooled, from (B, M, 3)."""
-        codes = self.encoder(source.mT)
+    def encode(self, source: Tensor, share: Tensor | None = None) -> Tensor:
+        """(B, Z, 1), or (B, Z, M) where not pooled, from (B, M, 3) and (B, M)."""
+        share = _counted(share, self.config.by_area)
+        codes = self.encoder(source.mT, share)
         return codes.amax(dim=2, keepdim=True) if self.config.pool else codes
 
-    def forward(self, source: Tensor, identity: Tensor) -> Tensor:
+    def forward(
+        self,
+        source: Tensor,
+        identity: Tensor,
+        source_share: Tensor | None = None,
+        share: Tensor | None = None,
+    ) -> Tensor:
         """(B, N, 3) the identity in the pose of the source, in the identity's order.
 
-        Args:
-            source: (B, M, 3), identity: (B, N, 3), each in [-1, 1].
+        Args and errors as for `DSFFNet.forward`.
 
         Raises:
-            HeadError: as `DSFFNet.forward`; without pooling, M that is not N.
+            HeadError: without pooling, M that is not N, too.
         """
-        _check_points(source, identity)
+        _check_points(source, identity, source_share, share)
         if not self.config.pool and source.shape != identity.shape:
             raise HeadError(
                 "source",
@@ -442,12 +519,13 @@ class NPT(nn.Module):
                 "and codes that are not pooled",
                 "give as many, or set pool",
             )
-        code, points = self.encode(source), identity.mT.contiguous()
+        code, points = self.encode(source, source_share), identity.mT.contiguous()
+        share = _counted(share, self.config.by_area)
         weight, bias = _mixed(self.convs[0], code)
         h = _affine(weight, bias, points)
-        h = self.blocks[0](h, points, code)
+        h = self.blocks[0](h, points, code, share)
         for conv, block in zip(self.convs[1:], self.blocks[1:], strict=False):
-            h = block(conv(h), points, code)
+            h = block(conv(h), points, code, share)
         return (2 * self.convs[-1](h).tanh()).mT
 
 
@@ -661,16 +739,21 @@ class CoreNet(nn.Module):
             plan = optimal_transport(correlation, config.epsilon, config.iterations)
         return plan, features
 
-    def forward(self, source: Tensor, identity: Tensor) -> Tensor:
+    def forward(
+        self,
+        source: Tensor,
+        identity: Tensor,
+        source_share: Tensor | None = None,
+        share: Tensor | None = None,
+    ) -> Tensor:
         """(B, N, 3) the identity in the pose of the source, in the identity's order.
 
-        Args:
-            source: (B, M, 3), identity: (B, N, 3), each in [-1, 1].
+        Args and errors as for `DSFFNet.forward`, but the shares are not read.
 
         Raises:
-            HeadError: as `DSFFNet.forward`; too many vertices for a plan.
+            HeadError: too many vertices for a plan, too.
         """
-        _check_points(source, identity)
+        _check_points(source, identity, source_share, share)
         _check_plan(len(source), identity.shape[1], source.shape[1])
         plan, features = self.correspond(source, identity)
         h = self.start((plan @ source).mT)

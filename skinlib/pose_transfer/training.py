@@ -140,7 +140,7 @@ class TransferTrainer(Run):
         if config.mirrored and self.steps_done % 2:
             mirror = source.new_tensor([-1, 1, 1])
             source, identity, truth = source * mirror, identity * mirror, truth * mirror
-        predicted = self.network(source, identity)
+        predicted = self.network(source, identity, pairs.source_share, pairs.share)
         loss = pose_loss(predicted, truth, pairs.edges, config.edge_weight)
         self.optimizer.zero_grad()
         loss.backward()

@@ -12,9 +12,14 @@ from tqdm.auto import tqdm
 
 from skinlib.garments.garment import MESH_FILES, Z_UP
 from skinlib.geometry import mesh_edges
-from skinlib.head import HeadError
+from skinlib.head import Head, HeadError
 from skinlib.io import atomic
-from skinlib.pose_transfer.data import PosePairs, normalised, size_by_edges
+from skinlib.pose_transfer.data import (
+    PosePairs,
+    normalised,
+    size_by_edges,
+    vertex_shares,
+)
 from skinlib.pose_transfer.metrics import Scores, mean_scores, score
 from skinlib.pose_transfer.refine import REACH, as_rigid_as_possible
 
@@ -26,9 +31,8 @@ SAME = 1e-5
 @torch.inference_mode()
 def transfer_pose(
     network: nn.Module,
-    source: np.ndarray,
-    target: np.ndarray,
-    edges: np.ndarray,
+    source: Head | trimesh.Trimesh,
+    target: Head | trimesh.Trimesh,
     reach: float = REACH,
 ) -> np.ndarray:
     """(N, 3) float32: the target in the pose of the source, in its own size and order.
@@ -39,24 +43,28 @@ def transfer_pose(
     allows. A mesh in its own pose stays as it is.
 
     Args:
-        source: (M, 3), upright and facing as in training: Z up, facing -Y.
-        target: (N, 3), so, too. edges: (E, 2) of the target.
+        source: M vertices, upright and facing as in training: Z up, facing -Y.
+        target: N vertices, so, too; skeletons are not looked at.
         reach: of `as_rigid_as_possible`; 0 for what the network gives.
 
     Raises:
         HeadError: fewer than two vertices, NaN, all points at one place, no edge with a
             length, or more vertices than the network can take.
     """
-    boxed, mine = _boxed("source", source), _boxed("target", target)
-    if _same(boxed, mine):
-        return np.array(target, np.float32)
+    boxed = _boxed("source", source.vertices), _boxed("target", target.vertices)
+    rest = np.asarray(target.vertices)
+    if _same(*boxed):
+        return rest.astype(np.float32)
     device = next(network.parameters()).device
-    points = [torch.tensor(p[None], dtype=torch.float32) for p in (boxed, mine)]
-    posed = network(*(p.to(device) for p in points))[0].cpu().numpy()
-    posed = posed * size_by_edges(posed, target, edges)
-    posed = as_rigid_as_possible(posed, target, edges, reach)
+    points = [torch.tensor(p[None], dtype=torch.float32, device=device) for p in boxed]
+    faces = [torch.tensor(np.asarray(m.faces), device=device) for m in (source, target)]
+    shares = map(vertex_shares, points, faces)
+    posed = network(*points, *shares)[0].cpu().numpy()
+    edges = mesh_edges(np.asarray(target.faces))
+    posed = posed * size_by_edges(posed, rest, edges)
+    posed = as_rigid_as_possible(posed, rest, edges, reach)
     low, high = posed.min(0), posed.max(0)
-    floor, top = np.min(target, axis=0), np.max(target, axis=0)
+    floor, top = rest.min(0), rest.max(0)
     place = (floor + top) / 2 - (low + high) / 2
     place[2] = floor[2] - low[2]
     return (posed + place).astype(np.float32)
@@ -167,11 +175,8 @@ def transfer_file(
     """
     check_mesh_target(out)
     poser, mesh = read_mesh(source), read_mesh(target)
-    edges = mesh_edges(np.asarray(mesh.faces))
     try:
-        mesh.vertices = transfer_pose(
-            network, poser.vertices, mesh.vertices, edges, reach
-        )
+        mesh.vertices = transfer_pose(network, poser, mesh, reach)
     except HeadError as error:
         file = source if error.field == "source" else target
         raise HeadError(error.field, error.found, error.fix, file) from error
@@ -198,7 +203,7 @@ def judge(
             some = pairs.batch(items[first : first + batch])
             posed = some.identity
             if network is not None:
-                posed = network(some.source, some.identity)
+                posed = network(*some.inputs)
             rows = (posed, some.truth, some.edges)
             rows = (part.cpu().numpy() for part in rows)
             for one in zip(*rows, some.height.tolist(), strict=True):

@@ -244,6 +244,36 @@ def pose_lab(outfit: Outfit, network: PBNS, **start: float) -> SliderLab:
     )
 
 
+# ---- one network, other bodies
+
+
+def sizes(
+    outfit: Outfit,
+    network: PBNS,
+    motion: Motion,
+    shapes: Mapping[str, Mapping[str, float]],
+    *,
+    frame: int = 0,
+    view: scenes.View = UPPER,
+    size: tuple[int, int] = TILE,
+    title: str | None = None,
+) -> Picture:
+    """A frame of a motion on bodies of other shapes, each in clothes of its size.
+
+    Args:
+        network: one that has learnt shapes.
+        shapes: amounts of the body's shapes, by the title that each is to have.
+    """
+    tiles = []
+    for shape in shapes.values():
+        body = replace(outfit.body, head=outfit.body.shaped(shape))
+        posed = outfit.pose(network, motion, shape)
+        tiles.append(
+            draw(replace(outfit, body=body), motion, posed, frame, view=view, size=size)
+        )
+    return grid(tiles, list(shapes), columns=len(tiles), title=title)
+
+
 # ---- playback
 
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from skinlib.head import Head, Skeleton
-from skinlib.pose_transfer.data import Cast, Pairs, normalised
+from skinlib.pose_transfer.data import Cast, Pairs, normalised, vertex_shares
 from skinlib.pose_transfer.networks import NPT, DSFFNet, FFAdaIN
 from skinlib.views import garments, scenes
 from skinlib.views.picture import FAINT, ColourBar, Picture, new_figure, rasterise
@@ -138,6 +138,7 @@ def pose_shares(
     network: DSFFNet | NPT,
     sources: Tensor,
     identity: Tensor,
+    faces: ArrayLike,
     told: int | None = None,
 ) -> np.ndarray:
     """(7,) after each of `LAYERS`: the share of the features' spread due to the pose.
@@ -147,7 +148,7 @@ def pose_shares(
     vertices: 0 where all poses give the same features.
 
     Args:
-        sources: (T, M, 3), T at least 2. identity: (N, 3).
+        sources: (T, N, 3), T at least 2. identity: (N, 3). faces: (F, 3) of all.
         told: only so many `FFAdaIN`, the first ones, are given the code of each pose;
             the others get the mean of the codes. All of them without.
 
@@ -174,7 +175,9 @@ def pose_shares(
         for layer in fused[len(fused) if told is None else told :]
     ]
     try:
-        network(sources, identity.expand(len(sources), -1, -1))
+        both = sources, identity.expand(len(sources), -1, -1)
+        triangles = torch.tensor(np.asarray(faces))
+        network(*both, *(vertex_shares(points, triangles) for points in both))
     finally:
         for hook in hooks:
             hook.remove()
@@ -246,11 +249,12 @@ def mix_picture(
     """The identity in a pose whose code lies between those of two sources.
 
     Args:
-        mesh: of the identity. identity: (N, 3). sources: (T, M, 3).
+        mesh: of all. identity: (N, 3). sources: (T, N, 3).
         first, second: two of these. mix: 0 is the first, 1 the second; beyond both the
             line between the codes goes on.
     """
-    posed = mixed(network, identity, sources[first], sources[second], [mix])[0]
+    ends = sources[first], sources[second]
+    posed = mixed(network, identity, *ends, mesh.faces, [mix])[0]
     view = replace(BOX, azimuth=view_from)
     return Picture(draw(mesh, posed, view=view, size=size), f"mix {mix:g}")
 
@@ -261,17 +265,22 @@ def mixed(
     identity: Tensor,
     first: Tensor,
     second: Tensor,
+    faces: ArrayLike,
     amounts: Sequence[float],
 ) -> np.ndarray:
     """(A, N, 3) the identity in the poses of the codes (1 - t) z1 + t z2.
 
     Args:
-        identity: (N, 3). first, second: (M, 3), (M', 3). amounts: t, A of them.
+        identity, first, second: (N, 3). faces: (F, 3) of all three. amounts: t, A of
+            them.
     """
-    one, other = (network.encode(source[None]) for source in (first, second))
+    points = torch.stack([identity, first, second])
+    shares = vertex_shares(points, torch.tensor(np.asarray(faces)))
+    one, other = network.encode(points[1:], shares[1:]).split(1)
     t = torch.as_tensor(amounts, dtype=one.dtype)[:, None, None]
     codes = one + t * (other - one)
-    return network.decode(codes, identity.expand(len(codes), -1, -1)).numpy()
+    many = points[:1].expand(len(codes), -1, -1), shares[:1].expand(len(codes), -1)
+    return network.decode(codes, *many).numpy()
 
 
 def mix_lab(
