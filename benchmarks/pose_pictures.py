@@ -48,8 +48,7 @@ def main(runs: tyro.conf.Positional[Path]) -> None:
     (cast,) = QUICK.casts("judge")
     pairs = PosePairs(cast, cast, 20, 3, poses=UNSEEN).batch(SHOWN)
     keep("transfer", transfers(networks, pairs))
-    mixed, _ = load_network(runs / "long" / "mixed")
-    keep("meshes", meshes(mixed, cast))
+    keep("meshes", meshes(networks["DSFFNet"], cast))
     keep("noise", noise(networks["DSFFNet"], cast))
     keep("dressed", dressed(cast))
     keep("curves", curves(runs))
@@ -65,7 +64,7 @@ def keep(name: str, picture: Picture) -> None:
 def transfers(networks: dict[str, nn.Module], pairs: Pairs) -> Picture:
     """A row for each pair: source, identity, every way painted by its error, truth."""
     mesh = quick_mesh()
-    made = {name: net(pairs.source, pairs.identity) for name, net in networks.items()}
+    made = {name: net(*pairs.inputs) for name, net in networks.items()}
     made = {name: in_mesh_order(points, pairs.order) for name, points in made.items()}
     source = in_mesh_order(pairs.source, pairs.source_order)
     identity, truth = (

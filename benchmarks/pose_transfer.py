@@ -74,6 +74,7 @@ LONG_RUNS = {
     "dsffnet": {},
     "npt": {},
     "corenet": {},
+    "dsffnet_from_half": {"alpha_init": 0.5},
     "dsffnet_by_vertex": {"by_area": False},
     "npt_by_area": {"by_area": True},
 }

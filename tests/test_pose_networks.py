@@ -26,7 +26,7 @@ from skinlib.pose_transfer.networks import (
 )
 
 TINY = {
-    "dsffnet": DSFFNetConfig(width=32, encoder=8, by_area=False),
+    "dsffnet": DSFFNetConfig(width=32, encoder=8, alpha_init=0.5, by_area=False),
     "npt": NPTConfig(width=32, encoder=8),
     "corenet": CoreNetConfig(width=32),
 }
@@ -323,7 +323,7 @@ def test_shares_that_are_not_there(name, share, words, source, identity):
 def test_instance_normalisation_takes_a_shared_code_out(features):
     h, v, code = features
     moved = h + 5 * torch.randn(2, 6, 1)
-    spadain, bare, ffadain = SPAdaIN(6), SPAdaIN(6, normalise=False), FFAdaIN(6, 5)
+    spadain, bare, ffadain = SPAdaIN(6), SPAdaIN(6, normalise=False), FFAdaIN(6, 5, 0.5)
     assert (spadain(moved, v, code) - spadain(h, v, code)).abs().max() < 1e-5
     assert (bare(moved, v, code) - bare(h, v, code)).abs().max() > 0.1
     assert (ffadain(h, v, 1 + code) - ffadain(h, v, code)).abs().max() > 0.1

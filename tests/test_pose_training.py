@@ -185,7 +185,7 @@ def test_half_of_the_judging_is_in_poses_that_were_learnt(few):
 
 
 def test_training_learns(tmp_path):
-    config = TransferConfig(settings=SMALL, steps=150, threads=1)
+    config = TransferConfig(settings=SMALL, steps=300, threads=1)
     network = train(config, [POSTS], tmp_path / "run")
     test = [PosePairs(POSTS, POSTS, 40, seed=9)]
     assert judge(network, test).pmd < 0.6 * judge(None, test).pmd

@@ -39,7 +39,7 @@ def network(kind: str = "dsffnet"):
     torch.manual_seed(0)
     if kind == "npt":
         return NPT(NPTConfig(width=32, encoder=8)).eval()
-    return DSFFNet(DSFFNetConfig(width=32, encoder=8)).eval()
+    return DSFFNet(DSFFNetConfig(width=32, encoder=8, alpha_init=0.5)).eval()
 
 
 @functools.cache

@@ -250,7 +250,7 @@ class FFAdaIN(SPAdaIN):
         self,
         channels: int,
         code: int,
-        alpha_init: float = 0.5,
+        alpha_init: float = 0.0,
         target_side: bool = True,
     ):
         super().__init__(channels)
@@ -309,7 +309,7 @@ class DSFFNetConfig:
 
     width: int = 1024  # of the pose code and the middle block; the others: a quarter
     encoder: int = 64  # channels of the encoder's first group
-    alpha_init: float = 0.5  # of alpha and beta; the source: 0
+    alpha_init: float = 0.0  # of alpha and beta, as in the source
     spadain_first: bool = False  # in each block, SPAdaIN in place of the first FFAdaIN
     target_side: bool = True  # the side of FFAdaIN that reads the identity alone
     by_area: bool = True  # means over the surface; the source: over the vertices
