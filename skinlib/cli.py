@@ -550,11 +550,11 @@ def garment_play(
     """Write a trained garment in motion, for Blender, an engine or numpy.
 
     For example:
-      skinlib garment play runs/t_shirt --poses walk --out walk.glb
+      skinlib garment play t_shirt --poses walk --shape weight 0.5 --out walk.glb
       skinlib garment play runs/t_shirt --poses my_motion.npz --out vertices.npz
 
     Args:
-        folder: What `skinlib garment train` wrote.
+        folder: What `skinlib garment train` wrote, or a shipped one, such as t_shirt.
         poses: Motion file (.npz), or walk, turn, squat or reach.
         out: A .glb has the body, the bones and the garments, with the blend shapes, or
             the virtual bones, driven frame by frame; a .npz has the vertices of every
@@ -615,7 +615,7 @@ def garment_evaluate(
     """Judge a trained garment beside skinning alone, on poses it has not learnt.
 
     Args:
-        folder: What `skinlib garment train` wrote.
+        folder: What `skinlib garment train` wrote, or a shipped one, such as t_shirt.
         poses: Motion file (.npz); else eight motions that no training draws.
         simulated: For one on virtual bones, the distance to these simulations, too, in
             mm; of another seed than those it has learnt.

@@ -1,5 +1,6 @@
 """Where the files that ship beside the package lie: samples and checkpoints."""
 
+from contextlib import suppress
 from pathlib import Path
 
 from skinlib.head import HeadError
@@ -49,3 +50,18 @@ def sample(name: str) -> Path:
 def checkpoint(name: str) -> Path:
     """Path of a folder in `checkpoints/`."""
     return repository_file("checkpoints", name)
+
+
+def trained(name: str | Path) -> Path:
+    """A folder that a training wrote; where there is none, the shipped one so called.
+
+    It need not exist: who reads from it says what is missing.
+
+    >>> trained("t_shirt") == checkpoint("t_shirt")
+    True
+    """
+    folder = Path(name)
+    if not folder.exists() and str(name) == folder.name:
+        with suppress(HeadError):
+            return checkpoint(folder.name)
+    return folder

@@ -278,6 +278,20 @@ def test_a_folder_holds_all_of_it(outfit, tmp_path, shapes):
     assert np.array_equal(last[0].pose(last[1], bends(), shape), poses[0])
 
 
+def test_the_shipped_shirt_is_found_by_its_name():
+    outfit, network = load_outfit("t_shirt")
+    still = Motion.create(
+        np.zeros((1, len(outfit.body.head.skeleton), 3)),
+        outfit.body.head.skeleton.names,
+    )
+    slim, heavy = (
+        outfit.pose(network, still, {"weight": amount})[0] for amount in (-1.0, 1.0)
+    )
+    waist = np.abs(slim[:, 2] - slim[:, 2].mean()) < 0.1
+    depth = [np.ptp(cloth[waist, 1]) for cloth in (slim, heavy)]
+    assert depth[1] > depth[0] + 0.005
+
+
 def test_a_network_of_an_older_version_has_the_units_of_then(outfit, tmp_path):
     plain = replace(SMALL, slope=0.0, rounding=0.0)
     network = learnt(outfit.network(plain, 2, False, 0)).eval()

@@ -27,6 +27,7 @@ from skinlib.garments.motion import Motion
 from skinlib.garments.pbns import PBNS, PBNSConfig
 from skinlib.head import HeadError
 from skinlib.painting import limit_influences
+from skinlib.paths import trained
 from skinlib.training.checkpoint import (
     CONFIG,
     WEIGHTS,
@@ -289,14 +290,16 @@ def save_outfit(
     replace_file(folder / CONFIG, f"{config}\n".encode())
 
 
-def load_outfit(folder: str | Path) -> tuple[Outfit, PBNS]:
-    """The outfit and the network that `skinlib garment train` wrote into a folder.
+def load_outfit(name: str | Path) -> tuple[Outfit, PBNS]:
+    """The outfit and the network that `skinlib garment train` wrote, or shipped ones.
+
+    Args:
+        name: a folder, or a name in `checkpoints/`.
 
     Raises:
         HeadError: there is none, it is not finished, or a file is damaged.
     """
-    folder = Path(folder)
-    command = "skinlib garment train"
+    folder, command = trained(name), "skinlib garment train"
     with reading_finished(folder, "outfit", "outfit", command) as (tensors, metadata):
         stored = json.loads(metadata["config"])
         config = PBNSConfig(**BEFORE | stored["network"])

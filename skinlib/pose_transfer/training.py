@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from skinlib.head import HeadError
-from skinlib.paths import checkpoint
+from skinlib.paths import trained
 from skinlib.pose_transfer.data import Cast, PosePairs
 from skinlib.pose_transfer.losses import EDGE_WEIGHT, pose_loss
 from skinlib.pose_transfer.networks import NETWORKS
@@ -214,10 +214,7 @@ def load_network(name: str | Path) -> tuple[nn.Module, dict]:
     Raises:
         HeadError: there is none, its training has not ended, or the file is damaged.
     """
-    folder = Path(name)
-    if not folder.exists() and str(name) == folder.name:
-        folder = checkpoint(folder.name)
-    command = "skinlib pose train"
+    folder, command = trained(name), "skinlib pose train"
     with reading_finished(folder, "model", "pose transfer", command) as (
         tensors,
         metadata,

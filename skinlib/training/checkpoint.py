@@ -109,7 +109,7 @@ def reading_finished(
             "its training has not ended" if unfinished else "there is no such file",
             f"run the same `{command}` again"
             if unfinished
-            else f"give a folder that `{command} --out` wrote",
+            else f"give a folder that `{command} --out` wrote, or a shipped name",
             path,
         )
     tensors, metadata = read_tensors(path)
