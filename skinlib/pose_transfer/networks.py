@@ -150,6 +150,37 @@ def instance_norm(h: Tensor, share: Tensor | None = None) -> Tensor:
     return centred * (centred.square() @ share + EPS).rsqrt()
 
 
+class PoseNetwork(nn.Module):
+    """What all of them are given, and what they give."""
+
+    def describe(self) -> dict:
+        """The configuration, as plain values."""
+        return asdict(self.config)
+
+    def forward(
+        self,
+        source: Tensor,
+        identity: Tensor,
+        source_share: Tensor | None = None,
+        share: Tensor | None = None,
+    ) -> Tensor:
+        """(B, N, 3) the identity in the pose of the source, in the identity's order.
+
+        Args:
+            source: (B, M, 3), identity: (B, N, 3), each in [-1, 1].
+            source_share: (B, M), share: (B, N): which part of the surface is around
+                each vertex, `vertex_shares`; needed if the configuration says
+                `by_area`, and else not read.
+
+        Raises:
+            HeadError: fewer than two vertices, which instance normalisation cannot
+                tell from their mean; NaN; shapes that do not fit; no shares, if needed;
+                what one of the networks alone cannot do.
+        """
+        _check_points(source, identity, source_share, share)
+        return self._posed(source, identity, source_share, share)
+
+
 class PoseEncoder(nn.Module):
     """(B, 3, M) -> (B, width, M): three times convolution, `instance_norm`, ReLU.
 
@@ -326,7 +357,7 @@ class DSFFNetConfig:
         return cls(**{"width": 256, "encoder": 32} | changes)
 
 
-class DSFFNet(nn.Module):
+class DSFFNet(PoseNetwork):
     """The pose as one code, the identity moved by it, and the code put in six times.
 
     The encoder makes a code of the source, the largest value of each channel over the
@@ -356,10 +387,6 @@ class DSFFNet(nn.Module):
         first = SPAdaIN(channels) if config.spadain_first else fused()
         return FFAdaINBlock(channels, first, fused())
 
-    def describe(self) -> dict:
-        """The configuration, as plain values."""
-        return asdict(self.config)
-
     def mixing(self) -> Tensor:
         """(L, 2) alpha and beta of each FFAdaIN, in the order of the layers.
 
@@ -378,26 +405,7 @@ class DSFFNet(nn.Module):
         share = _counted(share, self.config.by_area)
         return self.encoder(source.mT, share).amax(dim=2, keepdim=True)
 
-    def forward(
-        self,
-        source: Tensor,
-        identity: Tensor,
-        source_share: Tensor | None = None,
-        share: Tensor | None = None,
-    ) -> Tensor:
-        """(B, N, 3) the identity in the pose of the source, in the identity's order.
-
-        Args:
-            source: (B, M, 3), identity: (B, N, 3), each in [-1, 1].
-            source_share: (B, M), share: (B, N): which part of the surface is around
-                each vertex, `vertex_shares`; needed if the configuration says
-                `by_area`, and else not read.
-
-        Raises:
-            HeadError: fewer than two vertices, which instance normalisation cannot
-                tell from their mean; NaN; shapes that do not fit; no shares, if needed.
-        """
-        _check_points(source, identity, source_share, share)
+    def _posed(self, source, identity, source_share, share):
         return self.decode(self.encode(source, source_share), identity, share)
 
     def decode(
@@ -465,7 +473,7 @@ class NPTConfig:
         return cls(**{"width": 256, "encoder": 32} | changes)
 
 
-class NPT(nn.Module):
+class NPT(PoseNetwork):
     """The pose through the decoder, the identity from its side.
 
     The decoder starts at the mixed feature [z; v]. With a pooled code the first block
@@ -487,31 +495,13 @@ class NPT(nn.Module):
             for index, channels in enumerate(widths[1:4])
         )
 
-    def describe(self) -> dict:
-        """The configuration, as plain values."""
-        return asdict(self.config)
-
     def encode(self, source: Tensor, share: Tensor | None = None) -> Tensor:
         """(B, Z, 1), or (B, Z, M) where not pooled, from (B, M, 3) and (B, M)."""
         share = _counted(share, self.config.by_area)
         codes = self.encoder(source.mT, share)
         return codes.amax(dim=2, keepdim=True) if self.config.pool else codes
 
-    def forward(
-        self,
-        source: Tensor,
-        identity: Tensor,
-        source_share: Tensor | None = None,
-        share: Tensor | None = None,
-    ) -> Tensor:
-        """(B, N, 3) the identity in the pose of the source, in the identity's order.
-
-        Args and errors as for `DSFFNet.forward`.
-
-        Raises:
-            HeadError: without pooling, M that is not N, too.
-        """
-        _check_points(source, identity, source_share, share)
+    def _posed(self, source, identity, source_share, share):
         if not self.config.pool and source.shape != identity.shape:
             raise HeadError(
                 "source",
@@ -690,7 +680,7 @@ class CoreNetConfig:
         return cls(**{"width": 256} | changes)
 
 
-class CoreNet(nn.Module):
+class CoreNet(PoseNetwork):
     """Match the vertices, carry the source over, then refine: 3D-CoreNet.
 
     Optimal transport between features says which source vertices each vertex of the
@@ -719,10 +709,6 @@ class CoreNet(nn.Module):
         self.convs = nn.ModuleList(nn.Conv1d(a, b, 1) for a, b in pairwise(widths))
         self.blocks = nn.ModuleList(ElaINBlock(c, side) for c in widths[1:4])
 
-    def describe(self) -> dict:
-        """The configuration, as plain values."""
-        return asdict(self.config)
-
     def embed(self, points: Tensor) -> Tensor:
         """(B, width / 4, N) features of each vertex, from (B, N, 3)."""
         return self.refine(F.normalize(self.features(points.mT), dim=1))
@@ -739,21 +725,7 @@ class CoreNet(nn.Module):
             plan = optimal_transport(correlation, config.epsilon, config.iterations)
         return plan, features
 
-    def forward(
-        self,
-        source: Tensor,
-        identity: Tensor,
-        source_share: Tensor | None = None,
-        share: Tensor | None = None,
-    ) -> Tensor:
-        """(B, N, 3) the identity in the pose of the source, in the identity's order.
-
-        Args and errors as for `DSFFNet.forward`, but the shares are not read.
-
-        Raises:
-            HeadError: too many vertices for a plan, too.
-        """
-        _check_points(source, identity, source_share, share)
+    def _posed(self, source, identity, source_share, share):
         _check_plan(len(source), identity.shape[1], source.shape[1])
         plan, features = self.correspond(source, identity)
         h = self.start((plan @ source).mT)
