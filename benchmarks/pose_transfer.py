@@ -269,8 +269,11 @@ def _coarse(head: Head, vertices: int) -> Head:
 
 def noise(bench: Bench) -> dict:
     """Noise on the sources, for networks that learnt without it, and one with."""
-    settings = narrow("dsffnet", steps=LONG)
-    bench.trained("noise/learnt", QUICK, **settings, noise=0.02)
+    casts = bench.casts(QUICK)
+    config = TransferConfig(**narrow("dsffnet", steps=LONG), threads=bench.threads)
+    trainer = TransferTrainer(config, casts, bench.out / "noise" / "learnt")
+    trainer.pairs.append(PosePairs(*casts, *casts, LONG * config.batch, noise=0.05))
+    trainer.run()  # half of the steps are drawn from either
     runs = {run: f"long/{run}" for run in LONG_RUNS} | {"learnt": "noise/learnt"}
     found = {}
     for run, folder in runs.items():
