@@ -308,7 +308,7 @@ def test_a_vertex_in_pieces_counts_as_one(name, source, identity):
     ("share", "words"),
     [
         (None, "it is absent"),
-        (torch.ones(2, 36), r"\(2, 36\) for a identity of \(2, 37, 3\)"),
+        (torch.ones(2, 36), r"\(2, 36\) for the identity's \(2, 37, 3\)"),
     ],
 )
 def test_shares_that_are_not_there(name, share, words, source, identity):

@@ -62,7 +62,7 @@ def _check_points(
         if part is not None and part.shape != points.shape[:2]:
             raise HeadError(
                 "share",
-                f"shape {tuple(part.shape)} for a {name} of {tuple(points.shape)}",
+                f"shape {tuple(part.shape)} for the {name}'s {tuple(points.shape)}",
                 "give one number for each vertex",
             )
     if len(source) != len(identity) or not len(source):
