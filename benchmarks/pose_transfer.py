@@ -429,10 +429,10 @@ def faces(bench: Bench) -> dict:
             write_head(folder / f"{head.name}.npz", head)
     population = Population(str(folder), (500,), limits="wide")
     found = {"copy": bench.judged(None, bench.tests(population))}
-    for name in ("dsffnet", "npt"):
-        settings = narrow(name, steps=800)
-        network = bench.trained(f"faces/{name}", population, **settings)
-        found[name] = bench.judged(network, bench.tests(population))
+    for run in ("dsffnet", "dsffnet_by_vertex", "npt"):
+        settings = narrow(run.partition("_")[0], steps=800, settings=LONG_RUNS[run])
+        network = bench.trained(f"faces/{run}", population, **settings)
+        found[run] = bench.judged(network, bench.tests(population))
     return found
 
 

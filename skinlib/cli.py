@@ -677,6 +677,7 @@ def pose_train(
     rate: Annotated[float, arg(metavar="R")] = 2e-3,
     noise: Annotated[float, arg(metavar="A")] = 0.0,
     mirrored: bool = False,
+    by_vertex: bool = False,
     seed: Annotated[int, arg(metavar="S")] = 0,
     device: Annotated[str, arg(metavar="D")] = "cpu",
     threads: Annotated[int, arg(metavar="T")] = min(2, os.cpu_count() or 1),
@@ -690,7 +691,7 @@ def pose_train(
     For example:
       skinlib pose train --out runs/pose --device cuda
       skinlib pose train --out runs/small --width 256 --vertices 369 --steps 4000
-      skinlib pose train --out runs/faces --people cast --vertices --width 256
+      skinlib pose train --out runs/faces --people cast --vertices --by-vertex
 
     Args:
         out: Folder that all is written to; made when there is none.
@@ -706,6 +707,8 @@ def pose_train(
         rate: The highest learning rate.
         noise: On the sources, as a share of their size, such as 0.01.
         mirrored: Learn all of them in a mirror, too.
+        by_vertex: Means over vertices, not over the surface: for meshes that are all
+            alike, with the detail where they are dense, as heads are.
         seed: Same seed, same network.
         device: Where to compute, such as cpu or cuda.
         threads: CPU cores to use.
@@ -724,6 +727,8 @@ def pose_train(
     settings = {"width": width}
     if network != "corenet":  # the only one without this encoder
         settings["encoder"] = max(width // 16, 32)
+    if by_vertex and network != "corenet":  # it has no other means
+        settings["by_area"] = False
     config = TransferConfig(
         network=network,
         settings=settings,

@@ -94,8 +94,8 @@ def skin(run, *args) -> np.ndarray:
         ("garment play", "DIR --poses FILE|NAME --out --shape --ease .glb .npz"),
         ("garment evaluate", "DIR --poses --simulated --json"),
         ("pose train", "--out --people --vertices --identities --poses --network"),
-        ("pose train", "--wide --mirrored --width --steps --rate --noise --seed"),
-        ("pose train", "--device --threads Ctrl-C"),
+        ("pose train", "--wide --mirrored --by-vertex --width --steps --rate --noise"),
+        ("pose train", "--seed --device --threads Ctrl-C"),
         ("pose transfer", "SOURCE TARGET OUT --model --reach .glb .obj"),
         ("pose evaluate", "DIR --pairs --json"),
         ("lab", "--port --no-browser Ctrl-C"),
@@ -376,6 +376,14 @@ def test_options_of_pose_train_reach_the_training(run, posts):
     assert training["seed"] == population["seed"] == 3
     assert population["identities"] == 2 and population["vertices"] == []
     assert population["limits"] == "wide" and training["mirrored"]
+
+
+@pytest.mark.parametrize("option", [[], ["--by-vertex"]])
+def test_means_over_the_surface_unless_told_otherwise(run, posts, option):
+    out = "by_vertex" if option else "by_area"
+    assert run(*POSE.split(), "--steps", "1", "--out", out, *option) == 0
+    config = json.loads((posts / out / "config.json").read_text())
+    assert config["settings"]["by_area"] == (not option)
 
 
 @pytest.mark.parametrize(
