@@ -254,7 +254,7 @@ def sizes(
     shapes: Mapping[str, Mapping[str, float]],
     *,
     frame: int = 0,
-    view: scenes.View = UPPER,
+    view: scenes.View = WHOLE,
     size: tuple[int, int] = TILE,
     title: str | None = None,
 ) -> Picture:
